@@ -1,20 +1,22 @@
 """The thrust of a motor over its command, and the response of the vehicle to it, by regression."""
 
 from collections.abc import Sequence
+from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.signal import lfilter
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray
-from sb3_quad.envs.simulation.state import QUATERNION, VELOCITY, rotation_matrices
-from sb3_quad.envs.vehicles.layout import ORDERS
+from sb3_quad.envs.simulation.state import BODY_RATES
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.identification.flight_log import Log
 
 # The powers of a command that its thrust consists of, by the kind of the command
 POWERS = {"thrust": (1,), "rotor_speed": (2,), "share": (0, 1, 2)}
+# The sum of three correlations that speaks for another order
+LEAST_BETTER = 0.25
 
 
 class Curve(NamedTuple):
@@ -33,37 +35,11 @@ def powers(kind: str, commands: FloatArray) -> FloatArray:
     return np.stack([commands**power for power in POWERS[kind]], axis=-1)
 
 
-def one_kind(logs: Sequence[Log]) -> str:
-    """Return the kind of the commands of logs.
-
-    :raises ConfigError: they have different ones.
-    """
-    kinds = {log.kind: log.path for log in logs}
-    if len(kinds) > 1:
-        named = ", ".join(f"{path}: {kind}" for kind, path in kinds.items())
-        raise ConfigError(f"logs whose commands differ cannot be taken together ({named})")
-    return logs[0].kind
-
-
-def specific_force(log: Log) -> FloatArray:
-    """Return the specific force along z, (n,), m/s²: the accelerometer's, or what follows from the
-    motion.
-    """
-    if log.force is not None:
-        return log.force
-    force = np.gradient(log.motion[:, VELOCITY], log.step, axis=0)
-    force[:, 2] += 9.81
-    upward = rotation_matrices(log.motion[:, QUATERNION])[:, :, 2]
-    return np.asarray((force * upward).sum(axis=1))
-
-
 def lagged(values: FloatArray, gain: float, step: float) -> FloatArray:
     """Return the response of a first-order lag to values, (n, columns), that begins at rest."""
-    signal = require("scipy.signal", "fit", "the thrust of motors over their commands")
     kept = np.exp(-gain * step)
-    ba = [1.0 - kept], [1.0, -kept]
-    begin = signal.lfilter_zi(*ba)[:, None] * values[:1]
-    return np.asarray(signal.lfilter(*ba, values, axis=0, zi=begin)[0])
+    response, _ = lfilter([1.0 - kept], [1.0, -kept], values, axis=0, zi=kept * values[:1])
+    return np.asarray(response)
 
 
 def fit_curve(logs: Sequence[Log], vehicle: Vehicle) -> Curve:
@@ -71,7 +47,7 @@ def fit_curve(logs: Sequence[Log], vehicle: Vehicle) -> Curve:
 
     Its motors have the lag and the delay of the vehicle.
     """
-    if one_kind(logs) == "thrust":
+    if logs[0].kind == "thrust":
         return Curve("thrust", np.ones(1))
     return regress(logs, vehicle, vehicle.motor_gain_up, vehicle.delay * vehicle.control_step)[0]
 
@@ -79,72 +55,64 @@ def fit_curve(logs: Sequence[Log], vehicle: Vehicle) -> Curve:
 def regress(
     logs: Sequence[Log], vehicle: Vehicle, gain: float, delay: float
 ) -> tuple[Curve, float]:
-    """Fit the curve for motors with a lag and a delay to the specific force along z.
-
-    It adds the thrust of the air that flows past (least squares over all flights).
+    """Fit the curve for motors with a lag and a delay to the specific force along z (least squares
+    over all flights).
 
     :return: the curve, and the root mean square of the rest, m/s².
     """
-    kind = one_kind(logs)
+    kind = logs[0].kind
     regressors = []
     forces = []
     for log in logs:
-        commands = log.mean_commands(delay)
-        terms = powers(kind, np.nan_to_num(commands)).sum(axis=1)
-        slow = lagged(terms, gain, log.step)
+        terms = powers(kind, log.mean_commands(delay)).sum(axis=1)
         # A row's command acts until the next one, where the force of that row is.
-        regressors.append(slow[:-1][log.flying[1:]] / vehicle.mass)
-        forces.append(specific_force(log)[1:][log.flying[1:]])
+        rows = log.flying[1:]
+        regressors.append(lagged(terms, gain, log.step)[:-1][rows] / vehicle.mass)
+        forces.append(log.force[1:][rows])
     left = np.concatenate(regressors)
     right = np.concatenate(forces)
     # Hardly excited powers must not be taken for large numbers that cancel each other.
     scale = np.linalg.norm(left, axis=0)
     coefficients = np.linalg.lstsq(left / scale, right, rcond=1e-4)[0] / scale
-    rest = right - left @ coefficients
-    return Curve(kind, coefficients), float(np.sqrt(np.mean(rest**2)))
+    return Curve(kind, coefficients), float(np.std(right - left @ coefficients))
 
 
 def refuse_other_order(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> None:
-    """Refuse a log whose rotors turn the vehicle otherwise than its file says.
+    """Refuse a log that turns as with rotors in another order, or props that turn the other way.
 
     :param thrusts: commanded, in the vehicle's order, (n, 4), N.
-    :raises ConfigError: with the axis that answers the wrong way, and an order that would fit.
+    :raises ConfigError: with the axes that answer otherwise, and the order that fits.
     """
-    agreement = _agreement(log, vehicle.mixer, thrusts)
-    wrong = [
-        axis
-        for axis, value in zip(("roll", "pitch", "yaw"), agreement, strict=True)
-        if value < -0.25
-    ]
-    if not wrong:
+    orders = [*permutations(range(4))]
+    found = [_agreement(log, vehicle, thrusts[:, order]) for order in orders]
+    both = np.vstack([found, found * np.array([1.0, 1.0, -1.0])])
+    best = both.sum(axis=1).argmax()
+    better = both[best] - both[0]
+    if better.sum() < LEAST_BETTER:
         return
-    hints = []
-    for name, order in ORDERS.items():
-        other = [order.index(place) for place in ORDERS[log.order or "crazyflie"]]
-        if (_agreement(log, vehicle.mixer, thrusts[:, np.argsort(other)]) > 0.0).all():
-            hints.append(f"the order of {name}")
-    if wrong == ["yaw"]:
-        hints = ["props that turn the other way (rotor_directions)"]
-    advice = f"{hints[0]} would fit" if hints else "check axes, signs and the order of the motors"
+    named = [("roll", "pitch", "yaw")[axis] for axis in np.flatnonzero(better > 0.1)]
+    order = [motor + 1 for motor in orders[best % len(orders)]]
+    props = ""
+    if best >= len(orders):
+        props = ", with props that turn the other way (rotor_directions)"
     raise ConfigError(
-        f"{log.path}: {' and '.join(wrong)} answer{'s' * (len(wrong) == 1)} its motors the wrong "
-        f"way for {vehicle.name}: {advice}"
+        f"{log.path}: {' and '.join(named)}: the motors of {vehicle.name} turn it otherwise; the "
+        f"log fits its motors in the order {order}{props}; check axes and signs, too"
     )
 
 
-def _agreement(log: Log, mixer: FloatArray, thrusts: FloatArray) -> FloatArray:
+def _agreement(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> FloatArray:
     """Return the correlation of body accelerations with moments about each axis, (3,), for that lag
-    up to 0.1 s where it is largest.
+    up to 0.1 s where it is largest; 0 where nothing changes.
     """
-    moments = lagged(np.nan_to_num(thrusts), 30.0, log.step) @ mixer[1:].T
+    moments = lagged(thrusts, 30.0, log.step) @ vehicle.mixer[1:].T
+    rates = log.motion[:, BODY_RATES]
     near = max(round(0.02 / log.step), 1)
-    rates = log.motion[:, -3:]
+    turned = np.roll(rates, -near, axis=0) - rates
     found = []
-    for lag in range(0, round(0.1 / log.step), near):
-        turned = rates[lag + near :] - rates[lag:-near]
-        count = len(turned)
-        rows = log.flying[:count]
-        pairs = zip(turned[rows].T, moments[:count][rows].T, strict=True)
-        found.append([np.corrcoef(*pair)[0, 1] for pair in pairs])
-    best = np.array(found)
-    return best[np.abs(best).argmax(axis=0), range(3)]
+    for lag in range(0, 5 * near, near):
+        both = np.hstack([np.roll(turned, -lag, axis=0), moments])[log.flying]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found.append(np.corrcoef(both, rowvar=False).diagonal(3))
+    known = np.nan_to_num(found)
+    return np.asarray(known[np.abs(known).argmax(axis=0), range(3)])

@@ -7,40 +7,30 @@ the equations linearised at the optimum.
 """
 
 from collections.abc import Callable, Sequence
-from copy import copy
-from dataclasses import dataclass
+from itertools import product
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
+from scipy.optimize import least_squares
+from scipy.signal import detrend, savgol_filter
+from scipy.stats import t as student
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.imports import require
-from sb3_quad.base.types import FloatArray, StrDict
-from sb3_quad.envs.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from sb3_quad.base.errors import ConfigError, raised_as
+from sb3_quad.base.types import FloatArray, IntArray, StrDict
+from sb3_quad.envs.simulation.state import VELOCITY
 from sb3_quad.envs.vehicles.vehicle import MAX_PHYSICS_STEP, Vehicle
 from sb3_quad.identification.curve import Curve, refuse_other_order, regress
 from sb3_quad.identification.flight_log import MOTION_SIZE, Log
-from sb3_quad.identification.open_loop import Windows, log_thrusts, turned
-from sb3_quad.identification.parameters import (
-    DELAY,
-    FASTEST,
-    FIELDS,
-    LARGEST_CHANGE,
-    Guess,
-    Key,
-    Scaling,
-    keys_for,
-    value,
-    with_values,
-)
+from sb3_quad.identification.open_loop import Windows, gaps, log_thrusts
+from sb3_quad.identification.parameters import FASTEST, Guess, parameters_of
 
 Show = Callable[[int, int, str], object]
-# s
-SHORT = (0.02, 0.05, 0.1)
-LONG = (0.05, 0.1, 0.2, 0.3, 0.5)
-SHORT_RATES = (0.02, 0.04, 0.06, 0.08, 0.1)
-LONG_RATES = (0.02, 0.04, 0.06, 0.08, 0.1, 0.12, 0.14, 0.16, 0.18, 0.2)
-WARM_UP = 0.25
-SMOOTHED = 0.1
+# Short and long horizons of logs with velocity, and of body rates alone, s
+HORIZONS = np.array([0.02, 0.05, 0.1]), np.array([0.05, 0.1, 0.2, 0.3, 0.5])
+HORIZONS_OF_RATES = np.arange(0.02, 0.11, 0.02), np.arange(0.02, 0.21, 0.02)
+WARM_UP = 0.25  # s
+SMOOTHED = 0.1  # s
 MOST_WINDOWS = 1500
 # Of position, velocity, attitude, body rates and specific force, in the units of the motion: errors
 # of this size count as one in the first fit.
@@ -48,35 +38,25 @@ ERRORS = (0.1, 0.4, 0.15, 0.4, 2.0)
 # Lags and delays that the regression tries, s
 LAGS = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.06, 0.08, 0.11, 0.15])
 DELAYS = np.arange(0.0, 0.035, 0.005)
-FACTORS = 2.0 ** np.arange(-3.0, 3.5, 0.5)
 DIFFERENCE = 2e-3
 BLOCKS = 20
-# Half an interval, as a part of a positive parameter or of a typical linear one, beyond which the
-# logs do not tell it
-LARGEST_WIDTH = 0.4
+MOST_THRUST = 30.0  # of a motor at full command, by what it needs to hover
+# Half an interval, as a part of its value, beyond which the logs do not tell a parameter
+LARGEST_WIDTH = 0.7
 # No interval is narrower than this part of its value, or this many seconds of a delay: simulated
 # logs with noise show such errors beyond the jackknife's intervals.
 LEAST_WIDTH = 0.03
 LEAST_DELAY_WIDTH = 0.0015
 
 
-@dataclass(frozen=True)
-class Estimate:
-    """A parameter by the logs."""
-
-    key: Key
-    value: float  #: in its unit
-    width: float  #: half of the 95 % interval; NaN if the logs do not tell the parameter
-    reason: str = ""  #: why they do not
-
-
-@dataclass(frozen=True, eq=False)
-class Fit:
+class Fit(NamedTuple):
     """A vehicle from logs."""
 
     vehicle: Vehicle
     curve: Curve  #: thrust of a motor over its command
-    estimates: Sequence[Estimate]
+    #: a row for each parameter: its field, name and unit, start, value, width, which is half of the
+    #: 95 % interval, and the reason why the logs do not tell it, if so
+    estimates: pd.DataFrame
 
 
 class Model:
@@ -84,120 +64,100 @@ class Model:
 
     :param logs: the logs.
     :param start: what the vector changes.
-    :param keys: its elements.
     :param horizons: where predictions are compared, s.
     """
 
-    def __init__(
-        self, logs: Sequence[Log], start: Guess, keys: Sequence[Key], horizons: Sequence[float]
-    ) -> None:
+    def __init__(self, logs: Sequence[Log], start: Guess, horizons: FloatArray) -> None:
         self.logs = logs
-        self.scaling = Scaling(start, keys)
-        self.has_motion = all(log.has_motion for log in logs)
+        self.start = start
+        self.table = parameters_of(logs, start)
+        self.scale = self.table["size"].to_numpy()
+        self.limits = self.table[["least", "most"]].to_numpy()
+        self.has_motion = logs[0].has_motion
         step = logs[0].step
         ends = sorted({max(round(horizon / step), 1) for horizon in horizons})
-        rows = sum(log.flying.sum() for log in logs)
         # Windows of body rates alone share no sample.
-        stride = ends[-1] if not self.has_motion else max(1, round(rows / MOST_WINDOWS))
+        stride = ends[-1]
+        if self.has_motion:
+            stride = max(1, sum(log.flying.sum() for log in logs) // MOST_WINDOWS)
         self.windows = Windows(logs, start.vehicle, ends, stride, WARM_UP)
         if self.has_motion:
             # The noise of where a window begins would grow with some parameters, and bias them.
             smooth = np.concatenate([_smoothed(log) for log in logs])
             self.windows.start = smooth[self.windows.rows]
-        self.force = None
-        if all(log.force is not None for log in logs):
-            self.force = np.concatenate([log.force for log in logs])
-        self.sizes = np.array(ERRORS)[:, None] * np.ones(len(ends))
-        self.calls = 0
+        self.force = np.concatenate([log.force for log in logs])
+        self.sizes = [np.full((len(ends), 1), size) for size in ERRORS]
 
     def parts(self, vector: FloatArray) -> list[FloatArray]:
-        """Return errors of position, velocity, attitude, body rates and specific force where they
-        are known, (windows, horizons, columns) each.
+        """Return errors of position, velocity, attitude, body rates and specific force, (windows,
+        horizons, columns) each.
         """
-        guess = self.scaling.guess(vector)
+        guess = self.start.moved(vector * self.scale)
         windows = self.windows
         thrusts = log_thrusts(self.logs, guess.vehicle, guess.curve, guess.delay)
-        found: list[list[FloatArray]] = [[] for _ in ERRORS]
+        found = []
         for end, flown in zip(windows.ends, windows.fly(guess.vehicle, thrusts), strict=True):
             rows = windows.rows + end
-            record = windows.record[rows]
-            gap = flown[:, :MOTION_SIZE] - record
-            if self.has_motion:
-                found[0].append(gap[:, POSITION])
-                found[1].append(gap[:, VELOCITY])
-                found[2].append(turned(flown[:, :MOTION_SIZE], record))
-            found[3].append(gap[:, BODY_RATES])
-            if self.force is not None:
-                found[4].append(flown[:, MOTION_SIZE:] - self.force[rows, None])
-        parts = [np.stack(one, axis=1) if one else np.zeros((0, 0, 0)) for one in found]
+            force = flown[:, MOTION_SIZE:] - self.force[rows, None]
+            found.append([*gaps(flown, windows.record[rows]), force])
+        parts = [np.stack(one, axis=1) for one in zip(*found, strict=True)]
         # The first body rate of a window is as noisy as the others: only changes count. Where the
         # airspeed is unknown, so are the moments of the air, which change slowly.
-        times = np.array(windows.ends, float)
-        slow = np.vander(times / times[-1], 1 if self.has_motion else 2)
-        parts[3] -= np.einsum("hk,wkc->whc", slow @ np.linalg.pinv(slow), parts[3])
+        parts[3] = detrend(parts[3], 1, "constant" if self.has_motion else "linear")
         return parts
 
     def residuals(self, vector: FloatArray) -> FloatArray:
-        """Return all errors by their sizes, (windows, n)."""
-        self.calls += 1
+        """Return the errors that logs tell by their sizes, (windows, n)."""
         scaled = []
-        for part, sizes in zip(self.parts(vector), self.sizes, strict=True):
-            if part.size:
-                scaled.append((part / sizes[None, :, None]).reshape(len(part), -1))
+        for part, size in zip(self.parts(vector), self.sizes, strict=True):
+            scaled.append((part / size).reshape(len(part), -1))
+        known = np.hstack(scaled if self.has_motion else scaled[3:])
         # Predictions that diverge must not become infinite.
-        return np.asarray(np.clip(np.nan_to_num(np.hstack(scaled), nan=1e3), -1e3, 1e3))
-
-    def slopes(self, vector: FloatArray) -> FloatArray:
-        """Return the derivatives of the errors, (windows, n, keys), by differences."""
-        here = self.residuals(vector)
-        columns = []
-        for k in range(len(vector)):
-            there = vector.copy()
-            there[k] += DIFFERENCE
-            columns.append((self.residuals(there) - here) / DIFFERENCE)
-        return np.stack(columns, axis=2)
+        return np.asarray(np.clip(known, -1e3, 1e3))
 
     def weigh(self, vector: FloatArray) -> None:
         """Count errors by the size that they have now, each kind after each horizon."""
         for number, part in enumerate(self.parts(vector)):
-            if part.size:
-                spread = 1.4826 * np.median(np.abs(part), axis=(0, 2))
-                self.sizes[number] = np.maximum(spread, 1e-3 * ERRORS[number])
+            spread = 1.4826 * np.median(np.abs(part), axis=(0, 2))
+            self.sizes[number] = np.maximum(spread, 1e-3 * ERRORS[number])[:, None]
 
-    def solve(self, vector: FloatArray, evaluations: int) -> FloatArray:
-        """Return the vector with the least errors (soft L1) near a start."""
-        from scipy.optimize import least_squares
+    def solve(
+        self, vector: FloatArray, free: IntArray, evaluations: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Find the vector with the least errors (soft L1) near a start.
 
-        count = len(vector)
+        :param free: the elements of the vector that may change.
+        :return: the vector, the slopes of the errors, (windows, n, free), and the errors, (windows,
+            n), weighted so that their normal equations are those of soft L1.
+        """
+        found = vector.copy()
+
+        def residuals(values: FloatArray) -> FloatArray:
+            found[free] = values
+            return self.residuals(found).ravel()
+
+        def slopes(values: FloatArray) -> FloatArray:
+            here = residuals(values)
+            steps = DIFFERENCE * np.eye(len(free))
+            return np.stack([residuals(values + step) - here for step in steps], 1) / DIFFERENCE
+
+        limits = self.limits[free].T
         solution = least_squares(
-            lambda x: self.residuals(x).ravel(),
-            np.clip(vector, self.scaling.least, self.scaling.most),
-            jac=lambda x: self.slopes(x).reshape(-1, count),
-            bounds=(self.scaling.least, self.scaling.most),
+            residuals,
+            np.clip(vector[free], *limits),
+            slopes,
+            limits,
             loss="soft_l1",
             max_nfev=evaluations,
             xtol=1e-4,
             ftol=1e-5,
         )
-        return np.asarray(solution.x)
-
-    def equations(self, vector: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the normal equations of each block of the flights at a vector: (blocks, keys,
-        keys) and (blocks, keys).
-        """
-        errors = self.residuals(vector)
-        slopes = self.slopes(vector)
-        # Gauss and Newton's weights of soft L1
-        weights = 1.0 / np.sqrt(1.0 + errors**2)
-        block = np.arange(len(errors)) * BLOCKS // len(errors)
-        squares = []
-        products = []
-        for number in np.unique(block):
-            rows = block == number
-            weighted = weights[rows, :, None] * slopes[rows]
-            squares.append(np.einsum("wni,wnj->ij", weighted, slopes[rows]))
-            products.append(np.einsum("wni,wn->i", weighted, errors[rows]))
-        return np.array(squares), np.array(products)
+        found[free] = solution.x
+        # SciPy has weighted the slopes, but not the errors.
+        errors = solution.fun * (1.0 + solution.fun**2) ** 0.25
+        windows = len(self.windows.rows)
+        jacobian = solution.jac.reshape(windows, -1, len(free))
+        return found, jacobian, errors.reshape(windows, -1)
 
 
 def fit_vehicle(
@@ -211,67 +171,60 @@ def fit_vehicle(
     :param name: of the vehicle that is returned.
     :param show: called with what is done, the total, and what is being done.
     :raises ConfigError: the logs contradict the start, or do not fly for long enough.
-    :raises MissingExtra: SciPy is not installed.
     """
-    require("scipy.optimize", "fit", "fitting a vehicle")
     report = show or (lambda done, total, text: None)
-    report(0, 6, "regressions")
+    report(0, 5, "regressions")
     guess = first_guess(logs, start)
-    keys, held = keys_for(logs, guess)
-    has_motion = all(log.has_motion for log in logs)
-    short = SHORT if has_motion else SHORT_RATES
-    long = LONG if has_motion else LONG_RATES
-    report(1, 6, "short horizons")
-    model = Model(logs, guess, keys, short)
-    vector = model.solve(_scaled_moments(model), 12)
-    report(2, 6, "all horizons")
-    model = Model(logs, guess, keys, long)
+    short, long = HORIZONS if logs[0].has_motion else HORIZONS_OF_RATES
+    report(1, 5, "short horizons")
+    model = Model(logs, guess, short)
+    table = model.table
+    free = np.flatnonzero(table["reason"] == "")
+    vector, *_ = model.solve(guess.vector() / model.scale, free, 12)
+    report(2, 5, "all horizons")
+    # Sizes are those of what has been found, since damping grows with the inertia.
+    guess = guess.moved(vector * model.scale)
+    model = Model(logs, guess, long)
+    vector = guess.vector() / model.scale
     for _ in range(2):
         model.weigh(vector)
-        vector = model.solve(vector, 8)
-    report(3, 6, "intervals")
-    kept, reasons = _told(model, vector)
-    held |= reasons
-    known = {key: value(guess._replace(vehicle=start), key) for key in reasons}
-    model = _again(model, with_values(model.scaling.guess(vector), known), kept)
-    report(4, 6, "what the logs tell")
-    vector = model.solve(np.zeros(len(kept)), 8)
-    found = model.scaling.values(vector).tolist()
-    widths = model.scaling.widths(vector, jackknife(*model.equations(vector))).tolist()
-    estimates = []
-    for key, number, width in zip(kept, found, widths, strict=True):
-        least = LEAST_DELAY_WIDTH if key == DELAY else LEAST_WIDTH * abs(number)
-        estimates.append(Estimate(key, number, max(width, least)))
-    for key, reason in held.items():
-        estimates.append(Estimate(key, value(guess._replace(vehicle=start), key), np.nan, reason))
+        vector, slopes, errors = model.solve(vector, free, 8)
+    report(3, 5, "what the logs tell")
+    before = guess._replace(vehicle=start)
+    known = before.vector() / model.scale
+    for place, reason in _not_told(model, vector, free, slopes, errors).items():
+        vector[place] = known[place]
+        table.loc[place, "reason"] = reason
+    free = np.flatnonzero(table["reason"] == "")
+    vector, slopes, errors = model.solve(vector, free, 8)
+    known[free] = vector[free]
+    table["start"] = before.vector()
+    table["value"] = known * model.scale
+    delay = len(guess.curve.coefficients)
+    widths = np.full(len(table), np.nan)
+    widths[free] = jackknife(slopes, errors) * model.scale[free]
+    least = LEAST_WIDTH * np.abs(table["value"].to_numpy())
+    least[delay] = LEAST_DELAY_WIDTH
+    table["width"] = np.maximum(widths, least)
     # The delay of a vehicle is a whole number of control steps, and its lag makes up for the rest.
-    report(5, 6, "with whole steps of delay")
-    best = model.scaling.guess(vector)
-    steps = round(best.delay / start.control_step)
-    kept.remove(DELAY)
-    model = _again(model, best._replace(delay=steps * start.control_step), kept)
-    fitted = model.scaling.guess(model.solve(np.zeros(len(kept)), 5))
-    report(6, 6, "done")
-    return Fit(_as_file(start, fitted, logs, steps, name), fitted.curve, estimates)
+    report(4, 5, "with whole steps of delay")
+    steps = round(table["value"][delay] / start.control_step)
+    vector[delay] = steps * start.control_step / model.scale[delay]
+    vector, *_ = model.solve(vector, free[free != delay], 5)
+    known[free] = vector[free]
+    report(5, 5, "done")
+    with raised_as(ConfigError, f"{logs[0].path}: the fit is no vehicle that can fly"):
+        fitted = before.moved(known * model.scale)
+    return Fit(_with_limits(fitted, name, steps), fitted.curve, table)
 
 
 def _smoothed(log: Log) -> FloatArray:
     """Return the motion of a log with position, attitude and velocity smoothed, (n, 13)."""
-    from scipy.signal import savgol_filter
-
     motion = log.motion.copy()
     slow = slice(0, VELOCITY.stop)
-    size = 2 * round(0.5 * SMOOTHED / log.step) + 1
+    size = round(SMOOTHED / log.step) // 2 * 2 + 1
     motion[:, slow] = savgol_filter(motion[:, slow], size, 2, axis=0)
-    motion[:, QUATERNION] /= np.linalg.norm(motion[:, QUATERNION], axis=1, keepdims=True)
     return motion
-
-
-def _again(model: Model, start: Guess, keys: Sequence[Key]) -> Model:
-    """Return a model of the same errors from another start."""
-    again = copy(model)
-    again.scaling = Scaling(start, keys)
-    return again
 
 
 def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
@@ -279,118 +232,95 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
 
     :raises ConfigError: motors turn the vehicle otherwise than its file says.
     """
-    lags = [FASTEST] if logs[0].kind == "rotor_speed" else 1.0 / LAGS
-    found = []
-    for gain in lags:
-        for delay in DELAYS:
-            curve, rest = regress(logs, start, gain, delay)
-            found.append((rest, gain, delay, curve))
-    _, gain, delay, curve = min(found, key=lambda one: one[0])
-    commands = np.concatenate([log.mean_commands()[log.flying] for log in logs])
-    strongest = float(curve.thrust(np.array(commands.max())))
+    kind = logs[0].kind
+    gains = np.array([FASTEST]) if kind == "rotor_speed" else 1.0 / LAGS
+    pairs = [*product(gains.tolist(), DELAYS.tolist())]
+    found = [regress(logs, start, *pair) for pair in pairs]
+    best = int(np.argmin([rest for _, rest in found]))
+    curve, _ = found[best]
+    gain, delay = pairs[best]
+    for log in logs:
+        refuse_other_order(log, start, log_thrusts([log], start, curve, delay))
+    strongest = max(curve.thrust(log.mean_commands()).max() for log in logs)
     changes: StrDict = {
         "motor_gain": gain,
         "motor_integration": "exact",
         "control_step": logs[0].step,
         "physics_step": MAX_PHYSICS_STEP,
         "delay": 0,
-        # Nothing is clipped.
+        # Nothing is clipped, and the search may pass through anything.
+        "allow_impossible_inertia": True,
         "rotor_thrust_limits": (0.0, 4.0 * max(strongest, start.hover_thrust)),
     }
-    if curve.kind == "rotor_speed":
+    if kind == "rotor_speed":
         changes["thrust_coefficient"] = float(curve.coefficients[0])
-    guess = Guess(start.model_copy(update=changes), curve, delay)
-    for log in logs:
-        refuse_other_order(log, start, log_thrusts([log], start, curve, delay))
-    return guess
+    # Commands that cannot be right are refused at once.
+    _with_limits(Guess(start, curve, 0.0), start.name, 0)
+    return Guess(start.model_copy(update=changes), curve, delay)
 
 
-def _scaled_moments(model: Model) -> FloatArray:
-    """Return the vector with the moments of inertia, and then the yaw moment, that fit best among
-    multiples of the start's.
+def jackknife(slopes: FloatArray, errors: FloatArray) -> FloatArray:
+    """Return half of the 95 % intervals by leaving out one block of windows at a time, (keys,).
+
+    :param slopes: of the errors, (windows, n, keys).
+    :param errors: (windows, n).
     """
-    keys = model.scaling.keys
-    vector = np.zeros(len(keys))
-    for field in ("inertia", "moment_thrust_ratio"):
-        places = [k for k, key in enumerate(keys) if key[0] == field]
-        costs = []
-        for factor in FACTORS:
-            vector[places] = np.log(factor)
-            costs.append(np.sqrt(1.0 + model.residuals(vector) ** 2).sum())
-        vector[places] = np.log(FACTORS[np.argmin(costs)])
-    return vector
+    count = min(BLOCKS, len(errors))
+    rows = np.array_split(np.arange(len(errors)), count)
+    squares = np.array([np.einsum("wni,wnj->ij", slopes[one], slopes[one]) for one in rows])
+    products = np.array([np.einsum("wni,wn->i", slopes[one], errors[one]) for one in rows])
+    left = squares.sum(axis=0) - squares
+    right = products.sum(axis=0) - products
+    shifts = [np.linalg.lstsq(*one, rcond=None)[0] for one in zip(left, right, strict=True)]
+    return np.asarray(student.ppf(0.975, count - 1) * np.std(shifts, axis=0) * np.sqrt(count - 1))
 
 
-def jackknife(squares: FloatArray, products: FloatArray) -> FloatArray:
-    """Return half of the 95 % intervals by leaving out one block at a time, (keys,).
-
-    :param squares: of the normal equations of each block, (blocks, keys, keys).
-    :param products: their right-hand sides, (blocks, keys).
-    """
-    from scipy.stats import t
-
-    count = len(squares)
-    shifts = []
-    for one, other in zip(squares, products, strict=True):
-        left = squares.sum(axis=0) - one
-        shifts.append(-np.linalg.lstsq(left, products.sum(axis=0) - other, rcond=None)[0])
-    spread = np.sqrt((count - 1) * np.var(shifts, axis=0))
-    return np.asarray(t.ppf(0.975, count - 1) * spread)
-
-
-def _told(model: Model, vector: FloatArray) -> tuple[list[Key], dict[Key, str]]:
-    """Return the parameters that the logs tell, and why they do not tell the others.
+def _not_told(
+    model: Model, vector: FloatArray, free: IntArray, slopes: FloatArray, errors: FloatArray
+) -> dict[int, str]:
+    """Return which elements of the vector the logs do not tell, and why.
 
     The least certain one is held first, which makes the others more certain.
     """
-    squares, products = model.equations(vector)
-    scaling = model.scaling
-    values = scaling.values(vector)
-    # A parameter near zero must still be certain.
-    allowed = np.maximum(LARGEST_WIDTH * np.abs(values), 1e-30)
-    allowed[[key[0] in ("curve", "delay") for key in scaling.keys]] = np.inf
-    reasons = {}
+    held = {}
+    least, most = model.limits.T
     # A value that runs away says nothing.
-    limits = np.minimum(scaling.high, scaling.begin * np.exp(0.99 * LARGEST_CHANGE))
-    is_free = scaling.sizes == 0.0
-    far = is_free & ((values > 0.98 * limits) | (vector < -0.99 * LARGEST_CHANGE))
-    for k in np.flatnonzero(far):
-        reasons[scaling.keys[int(k)]] = f"it would run to {values[k]:.2g}"
-    kept = np.flatnonzero(~far)
+    far = (least > 0.0) & ((vector < 1.02 * least) | (vector > 0.98 * most))
+    for place in free[far[free]].tolist():
+        held[place] = f"it would run to {vector[place] * model.scale[place]:.2g}"
     while True:
-        half = np.zeros(len(vector))
-        half[kept] = jackknife(squares[:, kept][:, :, kept], products[:, kept])
-        widths = scaling.widths(vector, half)
-        worst = int(np.argmax(widths / allowed))
-        if widths[worst] <= allowed[worst]:
-            return [scaling.keys[int(k)] for k in kept], reasons
-        reasons[scaling.keys[worst]] = f"its interval would be ± {widths[worst]:.2g}"
-        kept = kept[kept != worst]
+        kept = np.flatnonzero(~np.isin(free, [*held]))
+        widths = jackknife(slopes[:, :, kept], errors)
+        shares = widths / np.maximum(np.abs(vector[free[kept]]), 1e-9)
+        # Thrust and delay are always fitted.
+        shares[: len(model.start.curve.coefficients) + 1] = 0.0
+        worst = shares.argmax()
+        if shares[worst] <= LARGEST_WIDTH:
+            return held
+        place = int(free[kept[worst]])
+        held[place] = f"its interval would be ± {widths[worst] * model.scale[place]:.2g}"
 
 
-def _as_file(start: Vehicle, fitted: Guess, logs: Sequence[Log], delay: int, name: str) -> Vehicle:
-    """Return the vehicle with what was fitted, and with the limits of its commands.
+def _with_limits(fitted: Guess, name: str, delay: int) -> Vehicle:
+    """Return a fitted vehicle with the limits of its commands.
 
-    :raises ConfigError: no vehicle can be like this.
+    :raises ConfigError: it does not hover.
     """
+    vehicle = fitted.vehicle
     changes: StrDict = {"name": name, "motor_integration": "exact", "delay": delay}
-    for field in FIELDS:
-        changes[field] = getattr(fitted.vehicle, field)
-    changes["motor_gain_down"] = changes["motor_gain_up"]
-    curve = fitted.curve
-    if curve.kind == "thrust":
-        low, high = curve.thrust(np.array(start.thrust_range))
-    elif curve.kind == "share":
-        low, high = curve.thrust(np.array([0.0, 1.0]))
-    else:
-        changes["thrust_coefficient"] = float(curve.coefficients[0])
-        changes |= {"motor_gain_up": start.motor_gain_up, "motor_gain_down": start.motor_gain_down}
-        commands = np.concatenate([log.mean_commands()[log.flying] for log in logs])
-        low, high = curve.thrust(np.array([commands.min(), commands.max()]))
-    if not high > 1.05 * start.hover_thrust:
+    limits = {
+        "thrust": vehicle.thrust_range,
+        "share": (0.0, 1.0),
+        "rotor_speed": vehicle.rotor_speed_range,
+    }
+    low, high = fitted.curve.thrust(np.array(limits[fitted.curve.kind]))
+    if not 1.05 < high / vehicle.hover_thrust < MOST_THRUST:
         raise ConfigError(
-            f"the motors would push with {high:.3g} N at full command, and {start.name} needs "
-            f"{start.hover_thrust:.3g} N of each to hover; is its mass right?"
+            f"the motors would push with {high:.3g} N at full command, and {vehicle.name} needs "
+            f"{vehicle.hover_thrust:.3g} N of each to hover; are its mass, and the commands' unit, "
+            "right?"
         )
-    changes["rotor_thrust_limits"] = max(low, 0.01 * start.hover_thrust), high
-    return start.model_copy(update=changes)
+    if fitted.curve.kind == "rotor_speed":
+        changes["thrust_coefficient"] = float(fitted.curve.coefficients[0])
+    changes["rotor_thrust_limits"] = max(low, 0.01 * vehicle.hover_thrust), high
+    return vehicle.model_copy(update=changes)

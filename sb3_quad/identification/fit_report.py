@@ -1,5 +1,6 @@
 """The results of a fit: a table, a vehicle file with comments, and a picture of its predictions."""
 
+import json
 from collections.abc import Sequence
 
 import numpy as np
@@ -12,100 +13,45 @@ from sb3_quad.envs.simulation.state import BODY_RATES, POSITION, VELOCITY
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.evaluation.plots import HEIGHT, WIDTH, legend, styled
 from sb3_quad.evaluation.tables import COLOURS, Table
-from sb3_quad.identification.curve import POWERS, Curve
-from sb3_quad.identification.fit import Estimate, Fit
-from sb3_quad.identification.flight_log import Log, flown
+from sb3_quad.identification.curve import Curve
+from sb3_quad.identification.fit import Fit
+from sb3_quad.identification.flight_log import MOTION_SIZE, Log
 from sb3_quad.identification.open_loop import Windows, log_thrusts
-from sb3_quad.identification.parameters import FIELDS, Guess, unit, value
 
-SYMBOLS = {"thrust": "T", "rotor_speed": "ω", "share": "u"}
 # How far each prediction of the picture goes, and how long the picture is, s
 AHEAD = 0.25
 SHOWN = 6.0
-HELD = "held: logs tell thrust and moments by mass alone"
+PANELS = (
+    ("body rate", "rad/s", BODY_RATES),
+    ("velocity", "m/s", VELOCITY),
+    ("position", "m", POSITION),
+)
 
 
-def label(estimate: Estimate, kind: str) -> str:
-    """Return what a parameter is called."""
-    field, element = estimate.key
-    if field == "curve":
-        return f"thrust, {SYMBOLS[kind]}^{POWERS[kind][element]}"
-    field = field.removesuffix("_up")
-    if field in FIELDS and len(FIELDS[field].elements) > 1:
-        return f"{field} {'xyz'[element]}"
-    return field
-
-
-def estimate_table(fit: Fit, start: Vehicle) -> Table:
+def estimate_table(fit: Fit) -> Table:
     """Return each parameter with its start and its interval, or why logs do not tell it."""
-    rows = [["mass", f"{start.mass:.4g}", f"{start.mass:.4g}", "kg", HELD]]
-    before = Guess(start, fit.curve, start.delay * start.control_step)
-    for estimate in fit.estimates:
-        field, _ = estimate.key
-        known = "" if field == "curve" else f"{value(before, estimate.key):.4g}"
-        text = f"held: {estimate.reason}" if estimate.reason else f"± {estimate.width:.2g}"
-        name = label(estimate, fit.curve.kind)
-        rows.append(
-            [name, known, f"{estimate.value:.4g}", unit(estimate.key, fit.curve.kind), text]
-        )
+    mass = f"{fit.vehicle.mass:.4g}"
+    rows = [["mass", mass, mass, "kg", "held: logs tell thrust and moments by mass alone"]]
+    for one in fit.estimates.itertuples():
+        told = f"held: {one.reason}" if one.reason else f"± {one.width:.2g}"
+        rows.append([one.name, f"{one.start:.4g}", f"{one.value:.4g}", one.unit, told])
     heads = ("parameter", "start", "fitted", "unit", "95 % interval")
     return Table(heads, rows, fit.vehicle.name, align="left")
 
 
-def write_vehicle(path: StrPath, fit: Fit, start: Vehicle, logs: Sequence[Log]) -> None:
-    """Write the vehicle file of a fit; comments hold the intervals and what was held.
+def write_vehicle(path: StrPath, fit: Fit, logs: Sequence[Log]) -> None:
+    """Write the vehicle file of a fit; its comments hold the table of the estimates.
 
     :raises ConfigError: a folder that cannot be written, or a full disk.
     """
+    seconds = sum(log.step * log.flying.sum() for log in logs)
     names = ", ".join(dict.fromkeys(log.path.name for log in logs))
-    lines = [
-        f"# Fitted by sb3-quad fit to {flown(logs):.0f} s of {names}. Start: {start.name}.",
-        "# ± is half of a 95 % interval, from leaving out one block of the flights at a time.",
-        f"# {curve_text(fit)}",
-    ]
+    lines = [f"# Fitted by sb3-quad fit to {seconds:.0f} s of {names}."]
+    lines += [f"# {line}" for line in estimate_table(fit).markdown().splitlines()]
     content = fit.vehicle.model_dump(mode="json", exclude_defaults=True)
-    content["motor_gain"] = content.pop("motor_gain_up")
-    del content["motor_gain_down"]
-    comments = {"mass": f"kg, {HELD}"}
-    for field in content:
-        of_field = [one for one in fit.estimates if one.key[0].removesuffix("_up") == field]
-        if of_field:
-            texts = [one.reason or f"± {one.width:.2g}" for one in of_field]
-            measure = unit(of_field[0].key, fit.curve.kind)
-            comments[field] = f"{measure}; {', '.join(dict.fromkeys(texts))}"
-    if "inertia" in comments:
-        comments["inertia"] += "; Izz by its ratio to Ixx + Iyy"
-    delays = [one for one in fit.estimates if one.key[0] == "delay"]
-    comments["delay"] = f"control steps; fitted {delays[0].value:.4f} ± {delays[0].width:.2g} s"
-    content.setdefault("delay", fit.vehicle.delay)
-    for field, entry in content.items():
-        # Lists of numbers take a line.
-        style = None if isinstance(entry, list) else False
-        text = yaml.safe_dump(
-            {field: _rounded(entry)}, default_flow_style=style, width=1000
-        ).strip()
-        comment = comments.get(field)
-        lines.append(f"{text:<44} # {comment}" if comment else text)
-    write_text(path, "\n".join(lines) + "\n")
-
-
-def _rounded(entry: object) -> object:
-    """Return numbers with six digits."""
-    if isinstance(entry, list):
-        return [_rounded(one) for one in entry]
-    return float(f"{entry:.6g}") if isinstance(entry, float) else entry
-
-
-def curve_text(fit: Fit) -> str:
-    """Return the thrust of a motor over its command as a formula."""
-    kind = fit.curve.kind
-    symbol = SYMBOLS[kind]
-    terms = []
-    for power, number in zip(POWERS[kind], fit.curve.coefficients, strict=True):
-        terms.append(f"{number:.4g}" + (f" {symbol}^{power}" if power else ""))
-    meaning = {"thrust": "of its command in N", "rotor_speed": "of its speed, rad/s"}
-    text = meaning.get(kind, "of its command u, 0 to 1")
-    return f"Thrust of a motor, N, {text}: {' + '.join(terms)}".replace("+ -", "- ")
+    short = json.loads(json.dumps(content), parse_float=lambda text: float(f"{float(text):.6g}"))
+    text = yaml.safe_dump(short, sort_keys=False, default_flow_style=None)
+    write_text(path, "\n".join([*lines, text]))
 
 
 @styled
@@ -117,44 +63,35 @@ def prediction_plot(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> Figu
     """
     step = vehicle.control_step
     log = logs[0]
-    first = int(np.argmax(log.flying))
-    shown = log.part(slice(first, first + round((SHOWN + 1.0) / step)))
     count = round(AHEAD / step)
-    windows = Windows([shown], vehicle, range(1, count + 1), count)
-    pieces = [windows.start]
-    thrusts = log_thrusts([log], vehicle, curve)
-    pieces += [flight[:, : windows.start.shape[1]] for flight in windows.fly(vehicle, thrusts)]
+    windows = Windows([log], vehicle, range(1, count + 1), count)
+    flights = windows.fly(vehicle, log_thrusts([log], vehicle, curve))
     # A row without numbers parts each prediction from the next.
-    predicted = np.stack([*pieces, np.full_like(windows.start, np.nan)], axis=1)
-    times = step * (windows.rows[:, None] + np.arange(count + 2))
-    rows = slice(windows.rows[0], windows.rows[-1] + count)
-    panels = [("body rate", "rad/s", BODY_RATES)]
-    if log.has_motion:
-        panels += [("velocity", "m/s", VELOCITY), ("position", "m", POSITION)]
+    pieces = [windows.start, *flights, np.full_like(windows.start, np.nan)]
+    predicted = np.concatenate([piece[:, None, :MOTION_SIZE] for piece in pieces], axis=1)
+    rows = np.arange(len(log.motion))[windows.rows[0] :][: round(SHOWN / step)]
+    shown = windows.rows < rows[-1]
+    times = step * (windows.rows[shown, None] + np.arange(count + 2))
+    panels = PANELS if log.has_motion else PANELS[:1]
     figure = Figure(figsize=(3 * WIDTH, HEIGHT * len(panels)), layout="constrained")
     all_axes = figure.subplots(len(panels), 3, squeeze=False, sharex=True)
-    for line, (name, unit_name, part) in zip(all_axes, panels, strict=True):
-        for axes, axis, k in zip(line, "xyz", range(part.start, part.stop), strict=True):
-            recorded = log.motion[rows, k]
-            axes.plot(step * np.arange(rows.start, rows.stop), recorded, "k", label="measured")
-            flat = predicted[:, :, k].ravel()
-            axes.plot(times.ravel(), flat, color=COLOURS[1], label="predicted", linewidth=1.2)
-            axes.set(ylabel=f"{name} {axis} ({unit_name})", xlabel="time (s)")
+    for line, (name, unit, part) in zip(all_axes, panels, strict=True):
+        for k, axes in enumerate(line, part.start):
+            axes.plot(step * rows, log.motion[rows, k], "k", label="measured")
+            flat = predicted[shown, :, k].ravel()
+            axes.plot(times.ravel(), flat, color=COLOURS[1], label="predicted")
+            axes.set(ylabel=f"{name} {'xyz'[k - part.start]} ({unit})", xlabel="time (s)")
     legend(figure)
     return figure
 
 
 def split(logs: Sequence[Log]) -> tuple[list[Log], list[Log]]:
-    """Return what to fit and what to judge: of three logs or more every third one judges, of fewer
-    the last third of each flight.
-    """
-    if len(logs) > 2:
-        return [log for k, log in enumerate(logs) if k % 3 != 1], [*logs[1::3]]
+    """Return what to fit, and what to judge: the last third of each flight."""
     fitted = []
     judged = []
     for log in logs:
-        done = np.cumsum(log.flying)
-        edge = int(np.searchsorted(done, done[-1] * 2 // 3))
+        rows = np.flatnonzero(log.flying)
+        edge = rows[len(rows) * 2 // 3]
         fitted.append(log.part(slice(0, edge)))
         judged.append(log.part(slice(edge, None)))
     return fitted, judged

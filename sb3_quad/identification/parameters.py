@@ -1,26 +1,47 @@
 """The parameters of a vehicle that logs can tell, as a vector for least squares."""
 
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.envs.simulation.state import BODY_RATES
 from sb3_quad.envs.vehicles.vehicle import LARGEST_STEP, MAX_PHYSICS_STEP, Vehicle
-from sb3_quad.identification.curve import Curve
+from sb3_quad.identification.curve import POWERS, Curve
 from sb3_quad.identification.flight_log import Log
 
-Key = tuple[str, int]
-"""A field of the vehicle and the element of it, or ``curve`` or ``delay``."""
-DELAY: Key = ("delay", 0)
-AXES = ("x", "y", "z")
 # Below this standard deviation of a body rate, its axis is not excited, rad/s.
 LEAST_RATE = 0.05
-# The most that the logarithm of a positive parameter may change
-LARGEST_CHANGE = 2.5
-LARGEST_DAMPING = 3.0  # times the typical one
 FASTEST = LARGEST_STEP["exact"] / MAX_PHYSICS_STEP  # 1/s
+
+
+class Term(NamedTuple):
+    """A field of a vehicle, or ``curve`` or ``delay``."""
+
+    unit: str
+    axes: str = " "  #: of its elements
+    # Limits, by the size of :func:`parameters_of`
+    least: float = 0.0
+    most: float = np.inf
+    needs_motion: bool = False  #: whether body rates and specific force alone do not tell it
+    needs_turns: bool = False
+
+
+TERMS = {
+    "curve": Term("N", least=-np.inf),
+    "delay": Term("s"),
+    "motor_gain_up": Term("1/s", least=0.08, most=12.0),
+    "inertia": Term("kg m²", "xy", 0.08, 12.0, needs_turns=True),
+    "moment_thrust_ratio": Term("m", "z", 0.08, 12.0, needs_turns=True),
+    "drag": Term("N s/m", "xyz", needs_motion=True),
+    "rotor_drag": Term("kg/rad", "xyz", needs_motion=True),
+    "translational_lift": Term("kg/m", needs_motion=True),
+    "airspeed_moment": Term("kg m/rad", "xy", -np.inf, needs_motion=True),
+    # More would be the controller's damping, which the commands contain.
+    "rate_damping": Term("N m s/rad", "xyz", most=3.0, needs_turns=True),
+}
 
 
 class Guess(NamedTuple):
@@ -30,175 +51,86 @@ class Guess(NamedTuple):
     curve: Curve
     delay: float  #: from a command to its effect, s
 
+    def numbers(self) -> dict[str, FloatArray]:
+        """Return what may be fitted, by the fields of ``TERMS``, (elements,) each.
 
-class Term(NamedTuple):
-    """A field of a vehicle that is fitted."""
+        Izz keeps its ratio to Ixx + Iyy.
+        """
+        found = {field: np.ravel(getattr(self.vehicle, field, ())) for field in TERMS}
+        found["curve"] = self.curve.coefficients
+        found["delay"] = np.array([self.delay])
+        found["inertia"] = found["inertia"][:2]
+        return found
 
-    field: str
-    unit: str
-    elements: Sequence[int] = (0,)
-    #: what a typical vehicle has, times 1; 0 if the value is positive and its logarithm is fitted
-    typical: str = ""
-    needs_motion: bool = False  #: whether body rates and specific force alone do not tell it
-    is_signed: bool = False
+    def vector(self) -> FloatArray:
+        """Return these numbers one after the other."""
+        return np.concatenate([*self.numbers().values()])
+
+    def moved(self, vector: FloatArray) -> "Guess":
+        """Return a guess with other numbers."""
+        changes: StrDict = {}
+        rest = vector.tolist()
+        for field, before in self.numbers().items():
+            changes[field] = rest[: len(before)]
+            rest = rest[len(before) :]
+        curve = Curve(self.curve.kind, np.array(changes.pop("curve")))
+        (delay,) = changes.pop("delay")
+        for field in ("motor_gain_up", "moment_thrust_ratio", "translational_lift"):
+            (changes[field],) = changes[field]
+        vehicle = self.vehicle
+        ratio = sum(changes["inertia"]) / sum(vehicle.inertia[:2])
+        changes["inertia"].append(ratio * vehicle.inertia[2])
+        gain = changes.pop("motor_gain_up")
+        if gain != vehicle.motor_gain_up:
+            changes["motor_gain"] = min(gain, FASTEST)
+        return Guess(vehicle.model_copy(update=changes), curve, delay)
 
 
-# A typical value is a product of these powers: of the mass, the moments of inertia, the speed of a
-# rotor in hover, and a rate of 1 or some 1/s.
-TERMS = (
-    Term("motor_gain_up", "1/s"),
-    Term("inertia", "kg m²", (0, 1)),
-    Term("moment_thrust_ratio", "m"),
-    Term("drag", "N s/m", (0, 1, 2), "mass", needs_motion=True),
-    Term("rotor_drag", "kg/rad", (0, 1, 2), "mass_by_speed", needs_motion=True),
-    Term("translational_lift", "kg/m", (0,), "mass", needs_motion=True),
-    Term("airspeed_moment", "kg m/rad", (0, 1), "inertia_by_speed", True, is_signed=True),
-    Term("rate_damping", "N m s/rad", (0, 1, 2), "inertia"),
-)
-ANY = Term("", "")
-FIELDS = {term.field: term for term in TERMS if term.field in Vehicle.model_fields}
+def parameters_of(logs: Sequence[Log], guess: Guess) -> pd.DataFrame:
+    """Return a table with a row for each number of the vector.
 
-
-def typical(term: Term, vehicle: Vehicle, element: int) -> float:
-    """Return the size that a linear parameter typically has, in its unit."""
-    speeds = 4.0 * vehicle.hover_rotor_speed
-    sizes = {
-        "mass": 0.3 * vehicle.mass,
-        "mass_by_speed": 0.3 * vehicle.mass / speeds,
-        "inertia": 3.0 * vehicle.inertia[element],
-        "inertia_by_speed": 10.0 * vehicle.inertia[element] / speeds,
+    Columns: field, name and unit; size, what changes the flight much, in this unit: the guess of
+    what is positive, or what a typical vehicle has; least and most, limits by the size; and reason,
+    why the logs do not tell it, or nothing if they may.
+    """
+    motion = np.concatenate([log.motion[log.flying] for log in logs])
+    turns = motion[:, BODY_RATES].std(axis=0) > LEAST_RATE
+    vehicle = guess.vehicle
+    speeds = vehicle.hover_speed_sum
+    sizes: dict[str, Any] = {
+        "delay": 0.01,
+        "drag": 0.3 * vehicle.mass,
+        "rotor_drag": 0.3 * vehicle.mass / speeds,
+        "translational_lift": 0.3 * vehicle.mass,
+        "airspeed_moment": np.array(vehicle.inertia[:2]) * 10.0 / speeds,
+        "rate_damping": np.array(vehicle.inertia) * 3.0,
     }
-    return sizes[term.typical]
-
-
-def keys_for(logs: Sequence[Log], start: Guess) -> tuple[list[Key], dict[Key, str]]:
-    """Return the parameters to fit, and for others why the logs do not tell them."""
-    keys: list[Key] = [("curve", k) for k in range(len(start.curve.coefficients))]
-    keys.append(DELAY)
-    held = {}
-    for term in FIELDS.values():
-        for element in term.elements:
-            reason = _unknown(term, element, logs, start)
-            if reason:
-                held[term.field, element] = reason
-            else:
-                keys.append((term.field, element))
-    return keys, held
-
-
-def _unknown(term: Term, element: int, logs: Sequence[Log], start: Guess) -> str:
-    """Return why logs do not tell a parameter; empty if they may."""
-    if term.needs_motion and not all(log.has_motion for log in logs):
-        return "the logs hold no velocity"
-    if term.field == "motor_gain_up" and start.curve.kind == "rotor_speed":
-        return "the logs hold the speeds themselves"
+    if guess.curve.kind == "share":
+        sizes["curve"] = vehicle.hover_thrust
     # Rotors turn with nearly the same mean speed all the time.
-    with_speed = any(getattr(start.vehicle, "rotor_drag", ()))
-    if term.field == ("drag" if with_speed else "rotor_drag"):
-        return "the other kind of drag explains the same"
-    axis = 2 if term.field == "moment_thrust_ratio" else element
-    if term.field in ("inertia", "moment_thrust_ratio", "rate_damping"):
-        rates = np.concatenate([log.motion[log.flying, BODY_RATES] for log in logs])
-        if rates[:, axis].std() < LEAST_RATE:
-            return f"the flights hardly turn about {AXES[axis]}"
-    return ""
-
-
-def value(guess: Guess, key: Key) -> float:
-    """Return a parameter."""
-    field, element = key
-    if field == "curve":
-        return float(guess.curve.coefficients[element])
-    if field == "delay":
-        return guess.delay
-    return float(np.ravel(getattr(guess.vehicle, field))[element])
-
-
-def unit(key: Key, kind: str) -> str:
-    """Return the unit of a parameter."""
-    field, _ = key
-    if field == "curve":
-        return {"rotor_speed": "N s²", "thrust": "1"}.get(kind, "N")
-    return "s" if field == "delay" else FIELDS[field].unit
-
-
-class Scaling:
-    """The vector of least squares: 0 at the start, about 1 for a large change.
-
-    :param start: where it is 0.
-    :param keys: its elements.
-    """
-
-    def __init__(self, start: Guess, keys: Sequence[Key]) -> None:
-        self.start = start
-        self.keys = keys
-        self.begin = np.array([value(start, key) for key in keys])
-        #: what changes a linear parameter by 1; 0 where the logarithm changes
-        self.sizes = np.array([_size(start, key) for key in keys])
-        signed = [key[0] == "curve" or FIELDS.get(key[0], ANY).is_signed for key in keys]
-        low = np.where(signed, -np.inf, 0.0)
-        linear = np.divide(low - self.begin, np.maximum(self.sizes, 1e-30))
-        is_linear = self.sizes > 0.0
-        self.least = np.where(is_linear, linear, -LARGEST_CHANGE) - 1e-9
-        self.most = np.where(is_linear, np.inf, LARGEST_CHANGE)
-        # More would be the controller's damping, which the commands contain.
-        damped = [key[0] == "rate_damping" for key in keys]
-        self.most[damped] = linear[damped] + LARGEST_DAMPING
-        self.low = low
-        self.high = np.array([FASTEST if key[0] == "motor_gain_up" else np.inf for key in keys])
-
-    def values(self, vector: FloatArray) -> FloatArray:
-        """Return the parameters of a vector, (keys,)."""
-        logarithmic = self.begin * np.exp(np.clip(vector, -LARGEST_CHANGE, LARGEST_CHANGE))
-        linear = self.begin + self.sizes * vector
-        return np.clip(np.where(self.sizes > 0.0, linear, logarithmic), self.low, self.high)
-
-    def widths(self, vector: FloatArray, widths: FloatArray) -> FloatArray:
-        """Return widths of the parameters by those of the vector."""
-        return np.where(self.sizes > 0.0, self.sizes, self.values(vector)) * widths
-
-    def guess(self, vector: FloatArray) -> Guess:
-        """Return what a vector means."""
-        found = dict(zip(self.keys, self.values(vector).tolist(), strict=True))
-        return with_values(self.start, found)
-
-
-def _size(start: Guess, key: Key) -> float:
-    """Return what changes a linear parameter much, in its unit; 0 for one that is positive."""
-    field, element = key
-    if field == "delay":
-        return 0.01
-    if field == "curve":
-        coefficients = start.curve.coefficients
-        return abs(coefficients[0]) if len(coefficients) == 1 else start.vehicle.hover_thrust
-    return typical(FIELDS[field], start.vehicle, element) if FIELDS[field].typical else 0.0
-
-
-def with_values(start: Guess, found: Mapping[Key, float]) -> Guess:
-    """Return a guess with other values of some parameters.
-
-    The third moment of inertia keeps its ratio to the sum of the others.
-    """
-    coefficients = start.curve.coefficients.copy()
-    fields: dict[str, FloatArray] = {}
-    delay = start.delay
-    for (field, element), number in found.items():
-        if field == "curve":
-            coefficients[element] = number
-        elif field == "delay":
-            delay = number
-        else:
-            default = np.array(getattr(start.vehicle, field), float)
-            np.atleast_1d(fields.setdefault(field, np.atleast_1d(default)))[element] = number
-    if "inertia" in fields:
-        before = start.vehicle.inertia
-        inertia = fields["inertia"]
-        inertia[2] = before[2] * inertia[:2].sum() / sum(before[:2])
-    changes: StrDict = {}
-    for field, numbers in fields.items():
-        is_number = np.ndim(getattr(start.vehicle, field)) == 0
-        changes[field] = float(numbers[0]) if is_number else tuple(numbers.tolist())
-    if "motor_gain_up" in changes:
-        changes["motor_gain"] = changes.pop("motor_gain_up")
-    vehicle = start.vehicle.model_copy(update=changes) if changes else start.vehicle
-    return Guess(vehicle, start.curve._replace(coefficients=coefficients), delay)
+    other_drag = "drag" if any(vehicle.rotor_drag) else "rotor_drag"
+    rows = []
+    for field, numbers in guess.numbers().items():
+        term = TERMS[field]
+        for k, size in enumerate(np.broadcast_to(sizes.get(field, numbers), len(numbers))):
+            axis = term.axes[k % len(term.axes)]
+            reason = ""
+            if term.needs_motion and not logs[0].has_motion:
+                reason = "the logs hold no velocity"
+            elif term.needs_turns and not turns["xyz".index(axis)]:
+                reason = f"the flights hardly turn about {axis}"
+            elif field == other_drag:
+                reason = "the other kind of drag explains the same"
+            elif field == "motor_gain_up" and guess.curve.kind == "rotor_speed":
+                reason = "the logs hold the speeds themselves"
+            name = field.removesuffix("_up")
+            if len(numbers) > 1:
+                name += f" {axis}"
+            if field == "curve":
+                name = f"thrust, {guess.curve.kind}^{POWERS[guess.curve.kind][k]}"
+            most = term.most
+            if field == "motor_gain_up":
+                most = min(most, FASTEST / size)
+            rows.append((field, name, term.unit, size, term.least, most, reason))
+    columns = ["field", "name", "unit", "size", "least", "most", "reason"]
+    return pd.DataFrame(rows, columns=columns)

@@ -2,69 +2,50 @@
 
 The content of a file decides what it is: PX4's ULog, Betaflight's blackbox, the log that a
 Crazyflie writes to its µSD card, or a CSV file of these, of NanoBench or with the plain columns.
+``formats.yaml`` names their columns. Everything becomes SI units, the body frame x forward, y left,
+z up, and a world frame with z up.
 """
 
 import struct
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.files import read_bytes
 from sb3_quad.base.imports import require
-from sb3_quad.base.types import FloatArray, StrPath
+from sb3_quad.base.types import FloatArray, StrDict, StrPath
+from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.envs.simulation.motions import read_table
-from sb3_quad.identification.formats import (
-    BETAFLIGHT,
-    COMMANDS,
-    CRAZYFLIE,
-    DEGREE,
-    PX4,
-    TABLES,
-    Columns,
-    Format,
-)
 
 LARGEST_LOG = 300_000_000  # bytes
-BLACKBOX = b"H Product:Blackbox"
-ULOG = b"ULog\x01\x12\x35"
-USD = b"\xbc"
-# Sizes of a Crazyflie's types are those of Python's struct.
-_TYPES = set("?bBhHiIqQefd")
+LONGEST_NAME = 100  # bytes
+FORMATS = read_yaml(Path(__file__).with_name("formats.yaml"))
+UNITS = FORMATS.pop("units")
+ORDERS_OF = FORMATS.pop("orders")
+DOWN = FORMATS.pop("down")
+MARKS = FORMATS.pop("marks")
+COMMANDS = ("thrust", "rotor_speed", "share")
 WAY_OUT = (
     "a log has motor commands, gyro, and an accelerometer or attitude and velocity; "
     "docs/your_vehicle.md lists the columns of each format"
 )
 
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """Columns that were recorded at the same times."""
-
-    time: FloatArray  #: (n,), s
-    columns: Mapping[str, Any]  #: (n,) each, by name
-
-    def take(self, columns: Columns) -> FloatArray:
-        """Return columns in the unit of their quantity, (n, columns)."""
-        values = np.stack([np.asarray(self.columns[name], float) for name in columns.names], axis=1)
-        return np.asarray((values - columns.zero) * columns.scale)
+Part = Mapping[str, Any]
+"""Columns that were recorded at the same times, (n,) each, by name."""
 
 
-Series = tuple[FloatArray, FloatArray]
-"""Times (n,), s, and values (n, columns)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Recording:
-    """The time series of a log, as :class:`~sb3_quad.identification.formats.Format` names them."""
+class Recording(NamedTuple):
+    """The time series of a log."""
 
     path: Path  #: of its file
-    format: Format
-    series: Mapping[str, Series]
+    order: str  #: of the motors, a key of ``ORDERS``; empty: that of the vehicle
+    #: by the quantities of ``formats.yaml``: time, s, and values, (n, 1 + columns)
+    series: dict[str, FloatArray]
 
 
 def read_recording(source: StrPath) -> Recording:
@@ -74,176 +55,132 @@ def read_recording(source: StrPath) -> Recording:
     :raises MissingExtra: the package that reads this format is not installed.
     """
     path = Path(source)
-    start = read_bytes(path, LARGEST_LOG)[: len(BLACKBOX)]
-    if start.startswith(ULOG):
-        return _recording(path, PX4, _ulog(path))
-    if start.startswith(BLACKBOX):
-        return _recording(path, *_blackbox(path))
-    if start.startswith(USD):
-        return _recording(path, CRAZYFLIE, _usd(path))
-    return _recording(path, *_table(path))
+    start = read_bytes(path, LARGEST_LOG)[:20]
+    with raised_as(ConfigError, f"{path}: not a log that can be read"):
+        for magic, (name, read) in READERS.items():
+            if start.startswith(magic):
+                return _recording(path, name, *read(path))
+        table, headers = _csv(path)
+        name = next((name for name, mark in MARKS.items() if mark in table), "plain CSV")
+        return _recording(path, name, [table], headers)
 
 
-def _recording(path: Path, log_format: Format, parts: Sequence[Part]) -> Recording:
-    series = {}
-    for name, alternatives in log_format.series.items():
-        for columns in alternatives:
+def _recording(path: Path, name: str, parts: Sequence[Part], headers: StrDict) -> Recording:
+    """Find the quantities of a format among the columns of a log."""
+    units = UNITS | _units(headers)
+    ((clock, clock_unit),) = FORMATS[name]["time"].items()
+    series: dict[str, FloatArray] = {}
+    for quantity, options in FORMATS[name].items():
+        for names, unit in options.items():
+            zero, scale = units[unit]
             for part in parts:
-                if name not in series and {*columns.names} <= {*part.columns}:
-                    series[name] = (part.time, part.take(columns))
-    if not series.keys() & {*COMMANDS} or "gyro" not in series:
-        missing = "motor commands" if "gyro" in series else "a gyro"
-        raise ConfigError(f"{path}: lacks {missing}; {WAY_OUT}")
-    if log_format.is_down:
-        for name, (_, values) in series.items():
-            # Of vectors and quaternions, the last two elements are those of y and z.
-            if name not in COMMANDS:
-                values[:, -2:] *= -1.0
-    return Recording(path, log_format, series)
+                if quantity not in series and {clock, *names.split()} <= part.keys():
+                    columns = [part[column] for column in names.split()]
+                    values = (np.array(columns, float) - zero) * scale
+                    time = np.array(part[clock], float) * units[clock_unit][1]
+                    series[quantity] = np.vstack([time, values]).T
+    for what, names in {"time": ["time"], "motor commands": COMMANDS, "gyro": ["gyro"]}.items():
+        if series.keys().isdisjoint(names):
+            raise ConfigError(f"{path}: lacks {what}; {WAY_OUT}")
+    del series["time"]
+    if name in DOWN:
+        # Of vectors and quaternions, the last two elements are those of y and z.
+        for quantity in series.keys() - COMMANDS:
+            series[quantity][:, -2:] *= -1.0
+    return Recording(path, ORDERS_OF.get(name, ""), series)
 
 
-def _ulog(path: Path) -> list[Part]:
-    pyulog = require("pyulog", "fit", f"{path}: reading a ULog")
-    with raised_as(ConfigError, f"{path}: not a ULog that can be read"):
-        log = pyulog.ULog(str(path), disable_str_exceptions=True)
-    parts = []
-    for data in log.data_list:
-        # What a sensor measured was true when it was sampled, what a motor gets when it is sent.
-        sampled = "" if data.name.startswith("actuator") else "timestamp_sample"
-        time = data.data.get(sampled, data.data["timestamp"]) * 1e-6
-        names = {f"{data.name}.{name}": values for name, values in data.data.items()}
-        parts.append(Part(time, names))
-    return parts
-
-
-def _blackbox(path: Path) -> tuple[Format, list[Part]]:
-    orangebox = require("orangebox", "fit", f"{path}: reading a blackbox log")
-    with raised_as(ConfigError, f"{path}: not a blackbox log that can be read"):
-        parser = orangebox.Parser.load(str(path))
-        names = parser.field_names
-        rows: list[Any] = []
-        # A log that was cut ends within a frame, where the parser fails.
-        with suppress(Exception):
-            # A frame of another kind is shorter.
-            rows += (frame.data for frame in parser.frames() if len(frame.data) == len(names))
-        # What a field lacks is no number.
-        table = np.array(rows, dtype=object).reshape(len(rows), len(names))
-        columns = {}
-        for name, values in zip(names, table.T, strict=True):
-            columns[name] = [x if isinstance(x, (int, float)) else np.nan for x in values]
-        return _betaflight(parser.headers), [_part(BETAFLIGHT, columns)]
-
-
-def _betaflight(headers: Mapping[str, Any]) -> Format:
-    """Return Betaflight's format with the units that the headers of a log say."""
-    series = dict(BETAFLIGHT.series)
-    if "acc_1G" in headers:
-        (columns,) = series["accelerometer"]
-        one = 2048.0 / float(headers["acc_1G"])
-        series["accelerometer"] = [columns._replace(scale=columns.scale * one)]
+def _units(headers: StrDict) -> StrDict:
+    """Return the units that the headers of a blackbox say."""
+    units: StrDict = {}
+    with suppress(KeyError):
+        units["acc_1G"] = 0.0, UNITS["g"][1] / float(headers["acc_1G"])
     # Before Betaflight 3 the gyro had its own unit.
     scale = headers.get("gyro_scale")
     if isinstance(scale, float) and scale != 1.0:
-        (columns,) = series["gyro"]
-        series["gyro"] = [columns._replace(scale=scale * DEGREE)]
-    low, high = _motor_range(headers.get("motorOutput"))
-    (columns,) = series["share"]
-    series["share"] = [columns._replace(zero=low, scale=1.0 / (high - low))]
-    return BETAFLIGHT._replace(series=series)
+        units["gyro_scale"] = 0.0, scale * UNITS["deg/s"][1]
+    # The commands for a motor that rests and one at full throttle
+    limits = str(headers.get("motorOutput")).strip("[]").split(",")
+    if len(limits) == 2 and float(limits[1]) <= 2000.0:
+        units["DShot"] = UNITS["PWM"]
+    return units
 
 
-def _motor_range(given: Any) -> tuple[float, float]:
-    """Return the commands for a motor that rests and one at full throttle."""
-    numbers = given if isinstance(given, (list, tuple)) else str(given or "").split(",")
-    if len(numbers) == 2 and float(numbers[1]) <= 2000.0:
-        return 1000.0, 2000.0
-    return 48.0, 2047.0
-
-
-def _part(log_format: Format, columns: Mapping[str, Any]) -> Part:
-    times = log_format.time
-    return Part(np.asarray(columns[times.names[0]], float) * times.scale, columns)
-
-
-def _usd(path: Path) -> list[Part]:
-    """Read what tools/usdlog of crazyflie-firmware reads."""
-    with raised_as(ConfigError, f"{path}: not a log of a Crazyflie that can be read"):
-        data = read_bytes(path, LARGEST_LOG)
-        version, kinds = struct.unpack_from("<HH", data, 1)
-        if version not in (1, 2):
-            raise ValueError(f"version {version}")
-        # Version 1 counts milliseconds, version 2 microseconds.
-        time, scale = ("<I", 1e-3) if version == 1 else ("<Q", 1e-6)
-        place = 5
-        layouts: dict[int, tuple[list[str], struct.Struct, list[Any]]] = {}
-        for _ in range(kinds):
-            (identifier,) = struct.unpack_from("<H", data, place)
-            _, place = _text(data, place + 2)
-            (count,) = struct.unpack_from("<H", data, place)
-            place += 2
-            fields = []
-            for _ in range(count):
-                field, place = _text(data, place)
-                name, _, kind = field.partition("(")
-                if kind[:1] not in _TYPES:
-                    raise ValueError(f"{field}: unknown type")
-                fields.append((name, kind[0]))
-            row = struct.Struct(time + "".join(kind for _, kind in fields))
-            layouts[identifier] = (["timestamp", *(name for name, _ in fields)], row, [])
-        # The last four bytes are a checksum; a log that was cut ends anywhere.
-        while place + 2 <= len(data):
-            (identifier,) = struct.unpack_from("<H", data, place)
-            if identifier not in layouts:
-                break
-            _, row, rows = layouts[identifier]
-            if place + 2 + row.size > len(data):
-                break
-            rows.append(row.unpack_from(data, place + 2))
-            place += 2 + row.size
+def _ulog(path: Path) -> tuple[list[Part], StrDict]:
+    pyulog = require("pyulog", "fit", f"{path}: reading a ULog")
     parts = []
-    for names, _, rows in layouts.values():
-        values = np.array(rows, float).reshape(len(rows), len(names)).T
-        parts.append(Part(values[0] * scale, dict(zip(names, values, strict=True))))
-    return parts
+    for data in pyulog.ULog(str(path), disable_str_exceptions=True).data_list:
+        # What a sensor measured was true when it was sampled, what a motor gets when it is sent.
+        sampled = "" if data.name.startswith("actuator") else "timestamp_sample"
+        part = {f"{data.name}.{name}": values for name, values in data.data.items()}
+        part["time"] = data.data.get(sampled, data.data["timestamp"])
+        parts.append(part)
+    return parts, {}
 
 
-def _text(data: bytes, place: int) -> tuple[str, int]:
-    """Return a text that ends with a zero, and the place after it."""
-    end = data.index(b"\0", place)
-    return data[place:end].decode(), end + 1
+def _blackbox(path: Path) -> tuple[list[Part], StrDict]:
+    orangebox = require("orangebox", "fit", f"{path}: reading a blackbox log")
+    parser = orangebox.Parser.load(str(path))
+    rows: list[Any] = []
+    # A log that was cut ends within a frame, where the parser fails.
+    with suppress(Exception):
+        rows.extend(frame.data for frame in parser.frames())
+    names = parser.field_names
+    # A frame of another kind is shorter, and what a field lacks is no number.
+    table = pd.DataFrame([row for row in rows if len(row) == len(names)], columns=names)
+    return [dict(table.apply(pd.to_numeric, errors="coerce"))], parser.headers
 
 
-def _table(path: Path) -> tuple[Format, list[Part]]:
-    """Read a CSV file.
+def _usd(path: Path) -> tuple[list[Part], StrDict]:
+    """Read what tools/usdlog of crazyflie-firmware reads."""
+    data = read_bytes(path, LARGEST_LOG)
+    version, kinds = struct.unpack_from("<HH", data, 1)
+    # Version 1 counts milliseconds, version 2 microseconds.
+    time, scale = {1: ("<I", 1.0), 2: ("<Q", 1e-3)}[version]
+    place = 5
+    layouts: dict[int, struct.Struct] = {}
+    names: dict[int, list[str]] = {}
+    for _ in range(kinds):
+        (kind,) = struct.unpack_from("<H", data, place)
+        place = data.index(b"\0", place + 2) + 3
+        (count,) = struct.unpack_from("<H", data, place - 2)
+        *fields, _ = data[place : place + LONGEST_NAME * count].split(b"\0", count)
+        place += len(b"\0".join(fields)) + 1
+        # Its types are those of Python's struct.
+        pairs = [field.decode().split("(") for field in fields]
+        layouts[kind] = struct.Struct(time + "".join(letters[0] for _, letters in pairs))
+        names[kind] = ["timestamp", *(name for name, _ in pairs)]
+    rows: dict[int, list[Any]] = {kind: [] for kind in layouts}
+    # The last four bytes are a checksum; a log that was cut ends anywhere.
+    with suppress(struct.error, KeyError):
+        while True:
+            (kind,) = struct.unpack_from("<H", data, place)
+            rows[kind].append(layouts[kind].unpack_from(data, place + 2))
+            place += 2 + layouts[kind].size
+    parts = []
+    for kind, values in rows.items():
+        table = pd.DataFrame(values, columns=names[kind], dtype=float)
+        table["timestamp"] *= scale
+        parts.append(dict(table))
+    return parts, {}
 
-    :raises ConfigError: it is of none of the formats.
-    """
-    headers, frame = _csv(path)
-    # Betaflight's blackbox_decode adds the unit of the time.
-    columns = {name.partition(" (us)")[0]: frame[name].to_numpy() for name in frame}
-    fitting = []
-    for log_format in TABLES:
-        known: set[str] = set()
-        for alternatives in log_format.series.values():
-            known.update(*(option.names for option in alternatives))
-        if log_format.time.names[0] in columns:
-            fitting.append((len(known & columns.keys()), log_format))
-    if not fitting:
-        raise ConfigError(f"{path}: has no column for the time; {WAY_OUT}")
-    _, log_format = max(fitting, key=lambda pair: pair[0])
-    part = _part(log_format, columns)
-    if log_format is BETAFLIGHT:
-        log_format = _betaflight(headers)
-    return log_format, [part]
+
+READERS: Mapping[bytes, tuple[str, Callable[[Path], tuple[list[Part], StrDict]]]] = {
+    b"ULog\x01\x12\x35": ("PX4", _ulog),
+    b"H Product:Blackbox": ("Betaflight", _blackbox),
+    b"\xbc": ("Crazyflie", _usd),
+}
 
 
-def _csv(path: Path) -> tuple[dict[str, str], Any]:
-    """Return the names and values above the table of a CSV file, and the table."""
-    lines = read_bytes(path, LARGEST_LOG).split(b"\n", 400)
+def _csv(path: Path) -> tuple[Part, StrDict]:
+    """Return the table of a CSV file, and the names and values above it."""
+    lines = read_bytes(path, LARGEST_LOG).split(b"\n", 400)[:-1]
     # Betaflight's Explorer writes the headers of the log above the names of the columns.
-    skipped = next((k for k, line in enumerate(lines[:-1]) if b"loopIteration" in line), 0)
+    skipped = next((k for k, line in enumerate(lines) if b"loopIteration" in line), 0)
     headers = {}
     for line in lines[:skipped]:
         name, _, value = line.decode(errors="replace").partition(",")
         headers[name.strip('" ')] = value.strip('"\r ')
-    return headers, read_table(path, LARGEST_LOG, skipped)
+    table = read_table(path, LARGEST_LOG, skipped)
+    # Betaflight's blackbox_decode adds the unit of the time.
+    return dict(table.rename(columns=lambda name: name.removesuffix(" (us)"))), headers

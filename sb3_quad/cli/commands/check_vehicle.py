@@ -89,7 +89,8 @@ def run(options: Namespace) -> int:
         from sb3_quad.identification.flight_log import read_logs
         from sb3_quad.identification.open_loop import error_table
 
-        console().print(error_table(read_logs(options.flights, vehicle.control_step), vehicle))
+        logs = read_logs(options.flights, vehicle.control_step)
+        console().print(error_table(logs, {vehicle.name: (vehicle, None)}))
     elif options.n_episodes:
         controllers = {"PID": PIDExpert(vehicle), "geometric": GeometricExpert(vehicle)}
         console().print(

@@ -72,11 +72,10 @@ def run(options: Namespace) -> int:
     judged = again if options.judge else split(again)[1]
     with progress_bar(options.progress) as show:
         fit = fit_vehicle(fitted, start, output.stem, show)
-    console().print(estimate_table(fit, start))
-    for vehicle in (start, fit.vehicle):
-        curve = fit.curve if vehicle is fit.vehicle else None
-        console().print(error_table(judged, vehicle, curve))
-    write_vehicle(output, fit, start, fitted)
+    console().print(estimate_table(fit))
+    vehicles = {"before": (start, None), "fitted": (fit.vehicle, fit.curve)}
+    console().print(error_table(judged, vehicles))
+    write_vehicle(output, fit, fitted)
     save_figure(prediction_plot(judged, fit.vehicle, fit.curve), picture)
     print("saved", output, "and", picture)
     return 0
