@@ -113,6 +113,6 @@ def _agreement(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> FloatArray:
     for lag in range(0, 5 * near, near):
         both = np.hstack([np.roll(turned, -lag, axis=0), moments])[log.flying]
         with np.errstate(divide="ignore", invalid="ignore"):
-            found.append(np.corrcoef(both, rowvar=False).diagonal(3))
+            found.append(np.diagonal(np.corrcoef(both, rowvar=False), 3))
     known = np.nan_to_num(found)
     return np.asarray(known[np.abs(known).argmax(axis=0), range(3)])

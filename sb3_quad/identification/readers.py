@@ -108,7 +108,7 @@ def _units(headers: StrDict) -> StrDict:
 
 def _ulog(path: Path) -> tuple[list[Part], StrDict]:
     pyulog = require("pyulog", "fit", f"{path}: reading a ULog")
-    parts = []
+    parts: list[Part] = []
     for data in pyulog.ULog(str(path), disable_str_exceptions=True).data_list:
         # What a sensor measured was true when it was sampled, what a motor gets when it is sent.
         sampled = "" if data.name.startswith("actuator") else "timestamp_sample"
@@ -157,7 +157,7 @@ def _usd(path: Path) -> tuple[list[Part], StrDict]:
             (kind,) = struct.unpack_from("<H", data, place)
             rows[kind].append(layouts[kind].unpack_from(data, place + 2))
             place += 2 + layouts[kind].size
-    parts = []
+    parts: list[Part] = []
     for kind, values in rows.items():
         table = pd.DataFrame(values, columns=names[kind], dtype=float)
         table["timestamp"] *= scale
