@@ -152,7 +152,8 @@ if __name__ == "__main__":
         # The target is the origin.
         quadcopter = Quadcopter(settings["vehicle"], position=np.array([3.0, -4.0, 2.0]))
         for _ in range(round(15.0 / settings["vehicle"]["control_step"])):
-            observed = observation(*quadcopter.state, action)
+            position, rotation, velocity, body_rates = quadcopter.state
+            observed = observation(position, rotation, velocity, body_rates, action)
             action, _state = model.predict(observed, deterministic=True)
             quadcopter.step(action)
         print(f"{path}: {np.linalg.norm(quadcopter.position):.3f} m from the target after 15 s")
