@@ -202,9 +202,9 @@ def test_a_run_flies_as_it_was_evaluated(run_folder, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "key"),
     [
-        ([], "CONTROLLER"),
+        ([], "controller"),
         (["pdi", "--no-render"], "'pid'"),
-        (["pid", "--env", "Pendulum-v1", "--no-render"], "--task"),
+        (["pid", "--env", "Pendulum-v1", "--no-render"], "rl_zoo3"),
         (["pid", "--task", "state-recovery", "--no-render"], "'state_recovery'"),
         (["pid", "--scenario", "side_hit", "--no-render"], "--scenario"),
         (

@@ -25,7 +25,7 @@ from sb3_quad.training.trainer import TrainingResult
 FRESH_EPISODES = 240  # in the table after a single run
 PIPELINE_EPISODES = 480  # in each table after a pipeline
 NEXT = """next:
-  sb3-quad enjoy {agent} --task {task} -o {label}.mp4
+  sb3-quad enjoy {agent} --env {env} -o {label}.mp4
   sb3-quad demo {agent} pid -o {label}.html
   sb3-quad evaluate {agent} --suite quick -o evaluations/{label}
   sb3-quad export {agent} --format onnx{vehicle}"""
@@ -146,7 +146,7 @@ def _print_next(run: RunFolder, agent: Path) -> None:
         NEXT.format(
             agent=shlex.quote(str(agent)),
             label=shlex.quote(f"{run.path.parent.name}_{run.path.name}"),
-            task=ENVIRONMENTS[run.name],
+            env=run.name,
             vehicle=" --vehicle itm" if settings.vehicles else "",
         )
     )

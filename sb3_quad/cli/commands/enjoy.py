@@ -20,9 +20,9 @@ examples:
 
 A controller is pid, geometric, the path of an SB3 zip or a run folder, or
 package.module:factory. NAME=CONTROLLER labels it. The settings of the first
-agent (vehicle, task and observation) hold for all, unless you give --task,
---scenario or --env-kwargs. The agent of a run is corrected_model.zip, else
-best_model.zip, else <Env>.zip.
+agent (vehicle, task and observation) hold for all, unless you give --env,
+--task, --scenario or --env-kwargs. The agent of a run is
+corrected_model.zip, else best_model.zip, else <Env>.zip.
 """
 
 import sys
@@ -33,7 +33,7 @@ from typing import Any
 
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
@@ -45,6 +45,8 @@ from sb3_quad.cli.parser import (
     Flags,
     given,
 )
+from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.training.options import DEFAULT_ENV
 
 # Width and height of the only panel, and of one of several, pixels.
 SINGLE = (640, 480)
@@ -64,8 +66,9 @@ def _size(text: str) -> tuple[int, int]:
 # Those of rl-zoo's ``enjoy.py``, with their meanings, and those of this command.
 FLAGS: Flags = {
     "episode": {
-        "--task": "a task (the first agent's, else target_tracking)",
-        "--scenario SUITE:NAME": "a scenario such as thesis:side_hit, instead of --task",
+        "--env": f"environment id ({DEFAULT_ENV})",
+        "--task": "a task such as target_tracking, instead of --env",
+        "--scenario SUITE:NAME": "a scenario such as thesis:side_hit, instead of --env",
     },
     "controllers CONTROLLER": (SEVERAL, "controllers to fly"),
     "-n --n-timesteps N": (
@@ -130,6 +133,11 @@ def _check(options: Namespace, window: bool) -> None:
 
     for name in given(options, "vehicle", "task").keys() & options.env_kwargs.keys():
         raise ConfigError(f"{name}: given by --{name} and by --env-kwargs; remove one of them")
+    env_id = options.env or DEFAULT_ENV
+    if env_id not in ENVIRONMENTS:
+        raise ConfigError(
+            f"{unknown('environment', env_id, ENVIRONMENTS)}; rl_zoo3.enjoy shows others"
+        )
     if options.size:
         check_size(*options.size)
     if options.output:
@@ -180,9 +188,11 @@ def _flight_settings(options: Namespace, first: Any) -> Any:
     """
     from sb3_quad.envs.simulation.settings import FlightSettings
 
-    settings = first or FlightSettings()
+    env_task = ENVIRONMENTS[options.env or DEFAULT_ENV]
+    settings = first or FlightSettings(task=env_task)
     changes = given(options, "vehicle")
-    if options.task and options.task != settings.task:
+    task = options.task or (options.env and env_task)
+    if task and task != settings.task:
         # The agent's changes to its own task do not fit another one.
-        changes |= {"task": options.task, "task_kwargs": None}
+        changes |= {"task": task, "task_kwargs": None}
     return settings.with_changes(**changes | options.env_kwargs)
