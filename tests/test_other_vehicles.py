@@ -77,7 +77,7 @@ def test_both_stages_are_trained_and_their_agents_flown_from_anywhere(
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
-    command = ["enjoy", str(here / "logs" / "ppo_bc" / f"{ENV}_1")]
+    command = ["enjoy", "--algo", "ppo_bc", "--env", ENV, "-f", str(here / "logs")]
     assert main([*command, "--no-render", "-n", "20"]) == 0
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes, write_text
-from sb3_quad.training.runs import claim_run, open_run
+from sb3_quad.training.runs import claim_run, find_run, open_run
 
 ENV = "QuadTargetTracking-v0"
 
@@ -31,6 +31,14 @@ def test_a_run_whose_start_alone_was_evaluated_has_not_begun(tmp_path):
     for timesteps, expected in (([0], True), ([0, 400], False)):
         np.savez(run.evaluations, timesteps=timesteps)
         assert run.not_begun == expected
+
+
+def test_the_latest_run_is_the_latest_with_an_agent(tmp_path):
+    first, empty = (claim_run(tmp_path, "dagger", ENV) for _ in range(2))
+    assert find_run(tmp_path, "dagger", ENV).path == empty.path
+    first.model.write_bytes(b"")
+    assert find_run(tmp_path, "dagger", ENV).path == first.path
+    assert find_run(tmp_path, "dagger", ENV, 2).path == empty.path
 
 
 @pytest.mark.slow

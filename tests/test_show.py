@@ -185,18 +185,30 @@ def run_folder(tmp_path):
     return run
 
 
-def test_a_run_flies_as_it_was_evaluated(run_folder, tmp_path, capsys):
-    asked = ["enjoy", str(run_folder.path)]
+def test_a_run_is_found_by_algorithm_environment_and_number(run_folder, tmp_path, capsys):
+    asked = ["enjoy", "--algo", "ppo", "--env", "QuadStateRecovery-v0"]
+    asked += ["-f", str(run_folder.path.parent.parent)]
     film = tmp_path / "film.gif"
     shown = ["--size", "64x64", "-o", str(film)] if VIDEO else ["--no-render"]
     assert main([*asked, "pid", *shown]) == 0
-    assert "0.30 s" in capsys.readouterr().out  # the run's own episodes
+    output = capsys.readouterr().out
+    assert str(run_folder.best_model) in output and "0.30 s" in output  # the run's own episodes
     if VIDEO:
         # A film is not replaced silently.
         before = film.read_bytes()
         assert main([*asked, "-n", "5", *shown]) == 2
         assert "--overwrite" in capsys.readouterr().err and film.read_bytes() == before
-    assert main(["enjoy", str(run_folder.best_model), "--stochastic", "--no-render"]) == 0
+    assert main([*asked, "--exp-id", "1", "--load-best", "--stochastic", "--no-render"]) == 0
+    for wrong, key in (
+        (["--exp-id", "7"], "QuadStateRecovery-v0_1"),
+        (["--load-last-checkpoint"], "--save-freq"),
+        (["--load-checkpoint", "500"], "best_model.zip"),
+        (["--algo", "ppoo"], "'ppo'"),
+    ):
+        capsys.readouterr()
+        assert main([*asked, "--no-render", *wrong]) == 2
+        error = capsys.readouterr().err
+        assert key in error and error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -215,7 +227,7 @@ def test_a_run_flies_as_it_was_evaluated(run_folder, tmp_path, capsys):
         (["pid", "-o", "poses.png"], ".mp4"),
         (["pid", "--size", "big"], "--size"),
         (["pid", "--speed", "0", "--no-render"], "--speed"),
-        (["pid", "--load-best", "--no-render"], "the folder of the run"),
+        (["pid", "--load-best", "--no-render"], "--load-best"),
         (["pid", "--vehicle", "itm", "--env-kwargs", "vehicle:itm", "--no-render"], "--vehicle"),
     ],
 )

@@ -66,7 +66,9 @@ def foreign_run(tmp_path):
 
 
 def enjoy_sac(path):
-    return main(["enjoy", str(path), "--no-render"])
+    return main(
+        ["enjoy", "--algo", "sac", "--env", ENV, "-f", str(path.parent.parent), "--no-render"]
+    )
 
 
 def test_ours_shows_runs_of_other_algorithms(foreign_run, capsys):

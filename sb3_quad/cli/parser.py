@@ -33,10 +33,6 @@ ELSEWHERE = {
     "-optimize": "the command sb3-quad tune does that",
     "--optimize-hyperparameters": "the command sb3-quad tune does that",
     "--trained-agent": "the flag is --initial-policy",
-    **dict.fromkeys(
-        ("--algo", "--exp-id", "--load-best", "--load-checkpoint", "--load-last-checkpoint"),
-        "give the folder of the run, or a zip in it",
-    ),
 }
 """Where flags of rl_zoo3 are found here, for the error message."""
 

@@ -81,6 +81,18 @@ class RunFolder:
         """Return the path of the model after ``timesteps``."""
         return self.path / f"rl_model_{timesteps}_steps.zip"
 
+    def latest_checkpoint(self) -> Path:
+        """Return the path of the latest checkpoint.
+
+        :raises ConfigError: the run has no checkpoint.
+        """
+        checkpoints = _numbered(self.path, "rl_model")
+        if not checkpoints:
+            raise ConfigError(
+                f"{self.path}: holds no checkpoint; train with --save-freq to have some"
+            )
+        return self.checkpoint(max(checkpoints))
+
     def write_yaml(self, settings: StrDict, arguments: StrDict) -> None:
         """Write config.yml, command.txt and args.yml.
 
@@ -191,3 +203,28 @@ def refuse_elsewhere(config: TrainingConfig, where: str, log_folder: Path) -> No
         for value in keywords.values():
             if isinstance(value, str) and not trusted():
                 refuse_outside(value, f"{where}: {name}", log_folder, Path())
+
+
+def find_run(log_folder: StrPath, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
+    """Find a run by rl-zoo's ``--exp-id``.
+
+    :param exp_id: number of the run; 0: the latest that has an agent.
+    :raises ConfigError: there is no such run; the message names the existing ones.
+    """
+    parent = Path(log_folder) / algo
+    name = file_name(env_id)
+    folders = _numbered(parent, name)
+    if not folders:
+        raise ConfigError(
+            f"{parent}: there is no run of {env_id}; give another place with --env, --algo or -f"
+        )
+    if exp_id <= 0:
+        with_agent = [number for number, path in folders.items() if any(path.glob("*.zip"))]
+        exp_id = max(with_agent or folders)
+    if exp_id not in folders:
+        raise ConfigError(
+            f"{parent}: there is no run {name}_{exp_id}; "
+            f"there is {', '.join(folder.name for folder in folders.values())}; "
+            "give another with --exp-id"
+        )
+    return RunFolder(folders[exp_id], name)

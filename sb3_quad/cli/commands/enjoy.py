@@ -3,10 +3,10 @@ r"""Watch controllers fly, in a window or as a film.
 Several controllers fly the same episodes side by side.
 
 examples:
-  # the agent of a run, in PyBullet's window
-  sb3-quad enjoy logs/ppo_bc/QuadStateRecovery-v0_1
-  # one of its checkpoints
-  sb3-quad enjoy logs/ppo_bc/QuadStateRecovery-v0_1/rl_model_500000_steps.zip
+  # the agent of the latest run, in PyBullet's window
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs
+  # the best agent of run 2
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 --exp-id 2 --load-best
   # a film with a panel for each of three controllers
   sb3-quad enjoy pid geometric agent=path/to/agent.zip --task state_recovery \
     --seed 13 -o recovery.mp4
@@ -21,7 +21,7 @@ examples:
 A controller is pid, geometric, the path of an SB3 zip or a run folder, or
 package.module:factory. NAME=CONTROLLER labels it. The settings of the first
 agent (vehicle, task and observation) hold for all, unless you give --env,
---task, --scenario or --env-kwargs. The agent of a run is
+--task, --scenario or --env-kwargs. Without --load-…, the agent of a run is
 corrected_model.zip, else best_model.zip, else <Env>.zip.
 """
 
@@ -39,7 +39,6 @@ from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     OVERWRITE,
     PAIRS,
-    SEVERAL,
     SWITCH,
     TRUST,
     Flags,
@@ -51,6 +50,8 @@ from sb3_quad.training.options import DEFAULT_ENV
 # Width and height of the only panel, and of one of several, pixels.
 SINGLE = (640, 480)
 PANEL = (480, 480)
+# The flags that say which agent of --algo flies.
+AGENT_OF_RUN = ("folder", "exp_id", "load_best", "load_checkpoint", "load_last_checkpoint")
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -65,12 +66,24 @@ def _size(text: str) -> tuple[int, int]:
 
 # Those of rl-zoo's ``enjoy.py``, with their meanings, and those of this command.
 FLAGS: Flags = {
+    # The run folder, and the agent in it.
+    "--algo": "algorithm of a trained agent, which is looked up in the log folder",
+    "-f --folder --log-folder DIR": (str, None, "folder that holds the run folders (logs)"),
+    "--exp-id N": (NonNegativeInt, None, "number of the run (0: the latest one that has an agent)"),
+    "agent": {
+        "--load-best": (SWITCH, None, "fly the best agent of the evaluations"),
+        "--load-checkpoint N": (NonNegativeInt, "fly the checkpoint after N timesteps"),
+        "--load-last-checkpoint": (SWITCH, None, "fly the last checkpoint"),
+    },
     "episode": {
         "--env": f"environment id ({DEFAULT_ENV})",
         "--task": "a task such as target_tracking, instead of --env",
         "--scenario SUITE:NAME": "a scenario such as thesis:side_hit, instead of --env",
     },
-    "controllers CONTROLLER": (SEVERAL, "controllers to fly"),
+    "controllers CONTROLLER": (
+        {"nargs": "*"},
+        "controllers to fly, in addition to the agent of --algo",
+    ),
     "-n --n-timesteps N": (
         PositiveInt,
         "control steps, in as many episodes as needed (one episode)",
@@ -125,12 +138,20 @@ def run(options: Namespace) -> int:
 def _check(options: Namespace, window: bool) -> None:
     """Refuse what can be refused before anything flies.
 
-    :raises ConfigError: A bad size or file, or no display for a window.
+    :raises ConfigError: No controller, a bad size or file, or no display for a window.
     """
     from sb3_quad.envs.rendering.window import has_display
     from sb3_quad.envs.simulation.checks import check_size
     from sb3_quad.show.film import check_film
 
+    if not (options.controllers or options.algo):
+        raise ConfigError(
+            "no controller given: name one, such as pid or agent.zip, or a run by --algo and --env"
+        )
+    if not options.algo:
+        for name in given(options, *AGENT_OF_RUN):
+            flag = name.replace("_", "-")
+            raise ConfigError(f"--{flag} chooses a run's agent, so it needs --algo; remove it")
     for name in given(options, "vehicle", "task").keys() & options.env_kwargs.keys():
         raise ConfigError(f"{name}: given by --{name} and by --env-kwargs; remove one of them")
     env_id = options.env or DEFAULT_ENV
@@ -155,10 +176,13 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     from sb3_quad.agents.resolve import resolve_expert
     from sb3_quad.cli.output import warn
     from sb3_quad.envs.vehicles.vehicle import first_vehicle
-    from sb3_quad.evaluation.controllers import parse_controllers
+    from sb3_quad.evaluation.controllers import ControllerSpec, parse_controllers
     from sb3_quad.show.episodes import fixed_setting, scenario_setting
 
     specs = parse_controllers(options.controllers)
+    if options.algo:
+        specs.insert(0, ControllerSpec(*_agent_of_run(options)))
+        print("agent:", specs[0].spec)
     # The settings of the first agent hold for all.
     first = next(filter(None, (spec.own for spec in specs)), None)
     if options.scenario is None:
@@ -191,8 +215,37 @@ def _flight_settings(options: Namespace, first: Any) -> Any:
     env_task = ENVIRONMENTS[options.env or DEFAULT_ENV]
     settings = first or FlightSettings(task=env_task)
     changes = given(options, "vehicle")
-    task = options.task or (options.env and env_task)
+    # With --algo, --env names the environment of the run rather than the task.
+    task = options.task or (options.env and not options.algo and env_task)
     if task and task != settings.task:
         # The agent's changes to its own task do not fit another one.
         changes |= {"task": task, "task_kwargs": None}
     return settings.with_changes(**changes | options.env_kwargs)
+
+
+def _agent_of_run(options: Namespace) -> tuple[str, str]:
+    """Return label and path of the agent of the run that ``--algo``, ``--env``, ``--exp-id`` and
+    ``--load-…`` name.
+
+    :raises ConfigError: No such run or file.
+    """
+    from sb3_quad.training.algorithms import get_algorithm
+    from sb3_quad.training.runs import find_run
+
+    folder = options.folder or "logs"
+    if not (Path(folder) / options.algo).is_dir():
+        # Raises if there is no such algorithm.
+        get_algorithm(options.algo)
+    run = find_run(folder, options.algo, options.env or DEFAULT_ENV, options.exp_id or 0)
+    if options.load_last_checkpoint:
+        path = run.latest_checkpoint()
+    elif options.load_best:
+        path = run.best_model
+    elif options.load_checkpoint is not None:
+        path = run.checkpoint(options.load_checkpoint)
+    else:
+        path = run.result
+    if not path.is_file():
+        zips = sorted(file.name for file in run.path.glob("*.zip"))
+        raise ConfigError(f"{path}: no such file; the run holds {', '.join(zips)}")
+    return f"{options.algo} {path.name}", str(path)
