@@ -37,20 +37,23 @@ _NAMES = {
     "": "Wrapper VecEnvWrapper RewardWrapper OrderEnforcing PassiveEnvChecker TimeLimit Autoreset"
     " RecordEpisodeStatistics RecordVideo HumanRendering RenderCollection AddWhiteNoise"
     " ObstructView ClipReward NormalizeReward TransformReward Monitor VecMonitor VecCheckNan"
-    " VecVideoRecorder VecNormalize VecTransposeImage ClipRewardEnv",
+    " VecVideoRecorder VecNormalize VecTransposeImage ClipRewardEnv PatchedTimeLimit"
+    " TruncatedOnSuccessWrapper DelayedRewardWrapper",
     "o": "ObservationWrapper TransformObservation FilterObservation FlattenObservation"
     " GrayscaleObservation ReshapeObservation RescaleObservation DtypeObservation"
     " ResizeObservation NormalizeObservation TimeAwareObservation FrameStackObservation"
     " DelayObservation DiscretizeObservation AddRenderObservation VecExtractDictObs VecFrameStack"
-    " WarpFrame",
-    "s": "RescaleAction RepeatAction",
-    "a": "ClipAction StickyAction StickyActionEnv DiscretizeAction",
+    " WarpFrame TimeFeatureWrapper HistoryWrapper HistoryWrapperObsDict MaskVelocityWrapper"
+    " YAMLCompatResizeObservation",
+    "s": "RescaleAction RepeatAction FrameSkip",
+    "a": "ClipAction StickyAction StickyActionEnv DiscretizeAction ActionNoiseWrapper"
+    " ActionSmoothingWrapper",
     "os": "MaxAndSkipObservation MaxAndSkipEnv AtariPreprocessing",
 }
 _KNOWN = {name: letters for letters, names in _NAMES.items() for name in names.split()}
 # A wrapper that is not known, and does not say, may do both.
 _ANY = "oa"
-_MAKERS = ("gymnasium", "stable_baselines3")
+_MAKERS = ("gymnasium", "stable_baselines3", "sb3_contrib", "rl_zoo3")
 # A wrapper that has its own version of one of these does something that its base does not.
 _METHODS = {"step", "reset", "step_async", "step_wait"}
 
