@@ -91,11 +91,6 @@ class Quadcopter:
         self.commands = vehicle["delay"] * [np.full(4, hover)]
         self.roots = np.full(4, np.sqrt(hover))
 
-    @property
-    def state(self):
-        """What the agent observes besides its last action."""
-        return self.position, self.rotation, self.velocity, self.body_rates
-
     def step(self, action):
         """Fly one control step.
 
@@ -152,8 +147,13 @@ if __name__ == "__main__":
         # The target is the origin.
         quadcopter = Quadcopter(settings["vehicle"], position=np.array([3.0, -4.0, 2.0]))
         for _ in range(round(15.0 / settings["vehicle"]["control_step"])):
-            position, rotation, velocity, body_rates = quadcopter.state
-            observed = observation(position, rotation, velocity, body_rates, action)
+            observed = observation(
+                quadcopter.position,
+                quadcopter.rotation,
+                quadcopter.velocity,
+                quadcopter.body_rates,
+                action,
+            )
             action, _state = model.predict(observed, deterministic=True)
             quadcopter.step(action)
         print(f"{path}: {np.linalg.norm(quadcopter.position):.3f} m from the target after 15 s")

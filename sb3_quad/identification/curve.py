@@ -84,8 +84,8 @@ def refuse_other_order(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> None:
     :raises ConfigError: with the axes that answer otherwise, and the order that fits.
     """
     orders = [*permutations(range(4))]
-    found = [_agreement(log, vehicle, thrusts[:, order]) for order in orders]
-    both = np.vstack([found, found * np.array([1.0, 1.0, -1.0])])
+    agreements = [_agreement(log, vehicle, thrusts[:, order]) for order in orders]
+    both = np.vstack([agreements, agreements * np.array([1.0, 1.0, -1.0])])
     best = both.sum(axis=1).argmax()
     better = both[best] - both[0]
     if better.sum() < LEAST_BETTER:
@@ -109,10 +109,10 @@ def _agreement(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> FloatArray:
     rates = log.motion[:, BODY_RATES]
     near = max(round(0.02 / log.step), 1)
     turned = np.roll(rates, -near, axis=0) - rates
-    found = []
+    correlations = []
     for lag in range(0, 5 * near, near):
         both = np.hstack([np.roll(turned, -lag, axis=0), moments])[log.flying]
         with np.errstate(divide="ignore", invalid="ignore"):
-            found.append(np.diagonal(np.corrcoef(both, rowvar=False), 3))
-    known = np.nan_to_num(found)
+            correlations.append(np.diagonal(np.corrcoef(both, rowvar=False), 3))
+    known = np.nan_to_num(correlations)
     return np.asarray(known[np.abs(known).argmax(axis=0), range(3)])

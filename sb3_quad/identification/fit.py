@@ -95,12 +95,12 @@ class Model:
         guess = self.start.moved(vector * self.scale)
         windows = self.windows
         thrusts = log_thrusts(self.logs, guess.vehicle, guess.curve, guess.delay)
-        found = []
+        errors = []
         for end, flown in zip(windows.ends, windows.fly(guess.vehicle, thrusts), strict=True):
             rows = windows.rows + end
             force = flown[:, MOTION_SIZE:] - self.force[rows, None]
-            found.append([*gaps(flown, windows.record[rows]), force])
-        parts = [np.stack(one, axis=1) for one in zip(*found, strict=True)]
+            errors.append([*gaps(flown, windows.record[rows]), force])
+        parts = [np.stack(one, axis=1) for one in zip(*errors, strict=True)]
         # The first body rate of a window is as noisy as the others: only changes count. Where the
         # airspeed is unknown, so are the moments of the air, which change slowly.
         parts[3] = detrend(parts[3], 1, "constant" if self.has_motion else "linear")
@@ -130,11 +130,11 @@ class Model:
         :return: the vector, the slopes of the errors, (windows, n, free), and the errors, (windows,
             n), weighted so that their normal equations are those of soft L1.
         """
-        found = vector.copy()
+        fitted = vector.copy()
 
         def residuals(values: FloatArray) -> FloatArray:
-            found[free] = values
-            return self.residuals(found).ravel()
+            fitted[free] = values
+            return self.residuals(fitted).ravel()
 
         def slopes(values: FloatArray) -> FloatArray:
             here = residuals(values)
@@ -152,12 +152,12 @@ class Model:
             xtol=1e-4,
             ftol=1e-5,
         )
-        found[free] = solution.x
+        fitted[free] = solution.x
         # SciPy has weighted the slopes, but not the errors.
         errors = solution.fun * (1.0 + solution.fun**2) ** 0.25
         windows = len(self.windows.rows)
         jacobian = solution.jac.reshape(windows, -1, len(free))
-        return found, jacobian, errors.reshape(windows, -1)
+        return fitted, jacobian, errors.reshape(windows, -1)
 
 
 def fit_vehicle(
@@ -182,7 +182,7 @@ def fit_vehicle(
     free = np.flatnonzero(table["reason"] == "")
     vector, *_ = model.solve(guess.vector() / model.scale, free, 12)
     report(2, 5, "all horizons")
-    # Sizes are those of what has been found, since damping grows with the inertia.
+    # Sizes are those as they were fitted, since damping grows with the inertia.
     guess = guess.moved(vector * model.scale)
     model = Model(logs, guess, long)
     vector = guess.vector() / model.scale
@@ -235,9 +235,9 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
     kind = logs[0].kind
     gains = np.array([FASTEST]) if kind == "rotor_speed" else 1.0 / LAGS
     pairs = [*product(gains.tolist(), DELAYS.tolist())]
-    found = [regress(logs, start, *pair) for pair in pairs]
-    best = int(np.argmin([rest for _, rest in found]))
-    curve, _ = found[best]
+    curves = [regress(logs, start, *pair) for pair in pairs]
+    best = int(np.argmin([rest for _, rest in curves]))
+    curve, _ = curves[best]
     gain, delay = pairs[best]
     for log in logs:
         refuse_other_order(log, start, log_thrusts([log], start, curve, delay))

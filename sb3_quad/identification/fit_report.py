@@ -33,8 +33,8 @@ def estimate_table(fit: Fit) -> Table:
     mass = f"{fit.vehicle.mass:.4g}"
     rows = [["mass", mass, mass, "kg", "held: logs tell thrust and moments by mass alone"]]
     for one in fit.estimates.itertuples():
-        told = f"held: {one.reason}" if one.reason else f"± {one.width:.2g}"
-        rows.append([one.name, f"{one.start:.4g}", f"{one.value:.4g}", one.unit, told])
+        interval = f"held: {one.reason}" if one.reason else f"± {one.width:.2g}"
+        rows.append([one.name, f"{one.start:.4g}", f"{one.value:.4g}", one.unit, interval])
     heads = ("parameter", "start", "fitted", "unit", "95 % interval")
     return Table(heads, rows, fit.vehicle.name, align="left")
 

@@ -24,8 +24,8 @@ from sb3_quad.identification.readers import COMMANDS, WAY_OUT, Recording, read_r
 
 # Rows below this height do not count, since the ground changes the thrust, m
 LEAST_HEIGHT = 0.3
-# Where the height is unknown, a vehicle flies while its motors get this share of what they usually
-# get, and not within this time of a start or landing, s.
+# Where the height is unknown, a vehicle flies while its motors get this share of their usual
+# command, and not within this time of a start or landing, s.
 FLYING_SHARE = 0.55
 NEAR_GROUND = 0.5
 # Longer gaps between rows are not filled, s
@@ -132,8 +132,8 @@ def read_logs(paths: Iterable[StrPath] | StrPath, step: float | None = None) -> 
     """
     files: list[Path] = []
     for path in [paths] if isinstance(paths, (str, Path)) else paths:
-        found = sorted(Path(path).iterdir()) if Path(path).is_dir() else [Path(path)]
-        files += [file for file in found if file.suffix not in (".yaml", ".yml", ".md")]
+        inside = sorted(Path(path).iterdir()) if Path(path).is_dir() else [Path(path)]
+        files += [file for file in inside if file.suffix not in (".yaml", ".yml", ".md")]
     recordings = [read_recording(file) for file in files if not file.is_dir()]
     if not recordings:
         raise ConfigError(f"{paths}: no logs there; {WAY_OUT}")
@@ -224,7 +224,7 @@ def _cleaned(name: str, table: FloatArray, notes: list[str]) -> FloatArray:
     if len(rows) < max(2, missing):
         raise ConfigError(f"{name}: {len(rows)} of {len(table)} rows hold numbers")
     if missing:
-        notes.append(f"{name}: {missing} of {len(table)} rows hold no number, and are left out")
+        notes.append(f"{name}: {missing} of {len(table)} rows hold no number, and are skipped")
     time = rows[:, 0]
     steps = np.diff(time, prepend=-np.inf)
     if steps.min() < 0.0:
@@ -364,7 +364,7 @@ def _refuse_unlike(
 def motor_thrusts(share: FloatArray, battery: FloatArray) -> FloatArray:
     """Return the thrusts that the Crazyflie's firmware expects from its commands, (n, 5), N.
 
-    Rows in which a motor rests, or gets more than it can, are left out.
+    Rows in which a motor rests, or gets more than it can, are skipped.
 
     :param share: times, s, and commands of the motors, 0 to 1, (n, 5).
     :param battery: times, s, and V, (samples, 2).

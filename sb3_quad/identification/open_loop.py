@@ -99,7 +99,7 @@ def log_thrusts(
     The motors of each log are calibrated against each other, so that the mean moment of the
     commands balances that of the air.
     """
-    found = []
+    scaled = []
     arms = np.vstack([np.ones(4), vehicle.rotor_arms])
     for log in logs:
         thrusts = curve.thrust(log.mean_commands(delay))[:, rotor_columns(log, vehicle)]
@@ -107,8 +107,8 @@ def log_thrusts(
         x, y, _ = log.mean_velocity * 4.0 * vehicle.hover_rotor_speed
         roll, pitch = vehicle.airspeed_moment
         wanted = np.linalg.solve(arms, [mean.sum(), -roll * y, pitch * x, 0.0])
-        found.append(thrusts * wanted / mean)
-    return np.concatenate(found)
+        scaled.append(thrusts * wanted / mean)
+    return np.concatenate(scaled)
 
 
 def gaps(motion: FloatArray, record: FloatArray) -> list[FloatArray]:
@@ -140,15 +140,15 @@ def open_loop(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> FloatArray
     thrusts = log_thrusts(logs, vehicle, curve)
     # They are calibrated already.
     vehicle = vehicle.model_copy(update={"thrust_factors": [1.0] * 4})
-    found = []
+    errors = []
     for end, flown in zip(ends, windows.fly(vehicle, thrusts), strict=True):
         time = end * vehicle.control_step
         stays[:, POSITION] = start[:, POSITION] + start[:, VELOCITY] * time
         rotation = attitudes(start) * Rotation.from_rotvec(start[:, BODY_RATES] * time)
         stays[:, QUATERNION] = rotation.as_quat()[:, [3, 0, 1, 2]]
         record = windows.record[windows.rows + end]
-        found.append([gaps(flown, record), gaps(stays, record)])
-    squares = np.square(found).sum(axis=4).mean(axis=3)
+        errors.append([gaps(flown, record), gaps(stays, record)])
+    squares = np.square(errors).sum(axis=4).mean(axis=3)
     return np.asarray(np.sqrt(squares) * [1.0, 1.0, 180.0 / np.pi, 1.0])
 
 

@@ -56,11 +56,11 @@ class Guess(NamedTuple):
 
         Izz keeps its ratio to Ixx + Iyy.
         """
-        found = {field: np.ravel(getattr(self.vehicle, field, ())) for field in TERMS}
-        found["curve"] = self.curve.coefficients
-        found["delay"] = np.array([self.delay])
-        found["inertia"] = found["inertia"][:2]
-        return found
+        numbers = {field: np.ravel(getattr(self.vehicle, field, ())) for field in TERMS}
+        numbers["curve"] = self.curve.coefficients
+        numbers["delay"] = np.array([self.delay])
+        numbers["inertia"] = numbers["inertia"][:2]
+        return numbers
 
     def vector(self) -> FloatArray:
         """Return these numbers one after the other."""

@@ -30,8 +30,8 @@ from sb3_quad.cli.parser import (
 
 FLAGS: Flags = {
     "logs LOG": (SEVERAL, "logs of one vehicle, or folders of them"),
-    "--vehicle": "name or file of what is known: mass, rotors (crazyflie for logs of one)",
-    "--judge LOG": (SEVERAL, [], "logs that judge the fit (each third log, or third of a log)"),
+    "--vehicle": "name or file with the known numbers: mass, rotors (crazyflie for logs of one)",
+    "--judge LOG": (SEVERAL, [], "logs that judge the fit (the last third of each log)"),
     "-o --output FILE": (str, "fitted.yaml", "vehicle file to write, with a .png (fitted.yaml)"),
     **OVERWRITE,
     **PROGRESS,
@@ -60,7 +60,7 @@ def run(options: Namespace) -> int:
     logs = read_logs(options.logs)
     if options.vehicle is None and logs[0].order != "crazyflie":
         raise ConfigError(
-            f"{logs[0].path}: give --vehicle, a file with the mass and the rotors of what flew"
+            f"{logs[0].path}: give --vehicle, a file with the mass and the rotors of your vehicle"
         )
     start = load_vehicle(options.vehicle or "crazyflie")
     for log in logs:
