@@ -182,7 +182,7 @@ def fit_vehicle(
     free = np.flatnonzero(table["reason"] == "")
     vector, *_ = model.solve(guess.vector() / model.scale, free, 12)
     report(2, 5, "all horizons")
-    # Sizes are those as they were fitted, since damping grows with the inertia.
+    # Sizes are those of the fit so far, since damping grows with the inertia.
     guess = guess.moved(vector * model.scale)
     model = Model(logs, guess, long)
     vector = guess.vector() / model.scale
