@@ -1,5 +1,6 @@
 """A multilayer perceptron and its gradients, by :mod:`.kernel`, on the threads that PyTorch had."""
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -53,8 +54,6 @@ class Perceptron:
         widths = np.array([-(-size // 4) * 4 for size in sizes])
         self._units = int(widths.sum())
         self._scratch_size = (self._units + 2 * int(widths.max())) * ROWS
-        # The calling thread's own memory; others that help allocate theirs.
-        self._scratch = _aligned(self._scratch_size)
         self._size = int((widths[1:] * (widths[:-1] + 1)).sum())
         packed = np.zeros(self._size, np.float32)
         self._layers = Layers(widths, kinds, packed)
@@ -185,16 +184,15 @@ class Perceptron:
         # Each part goes to one thread only, since `next` holds Python's global lock.
         firsts = iter(range(0, chunks, size))
 
-        def work(scratch: Float32Array) -> None:
+        def work() -> None:
+            scratch = _scratch(self._scratch_size)
             for first in firsts:
                 function(
                     first, min(first + size, chunks), chunks, scratch, self._layers, *arguments
                 )
 
-        helpers = [
-            _pool.submit(lambda: work(_aligned(self._scratch_size))) for _ in range(threads - 1)
-        ]
-        work(self._scratch)
+        helpers = [_pool.submit(work) for _ in range(threads - 1)]
+        work()
         for helper in helpers:
             # Do not wait for one that has not begun: its core is busy with something else.
             if not helper.cancel():
@@ -220,6 +218,15 @@ def _aligned(size: int) -> Float32Array:
     return memory[to_next_line : to_next_line + size]
 
 
+def _scratch(size: int) -> Float32Array:
+    """Return this thread's memory for ``size`` numbers, which its next call gets, too."""
+    memory: Float32Array | None = getattr(_own, "memory", None)
+    if memory is None or len(memory) < size:
+        memory = _own.memory = _aligned(size)
+    return memory
+
+
+_own = threading.local()
 # Threads that share the work of every perceptron, and the pool of all but the first. None of its
 # threads begins before there is work for it.
 _threads = 1
