@@ -55,12 +55,12 @@ def read_recording(source: StrPath) -> Recording:
     :raises MissingExtra: the package that reads this format is not installed.
     """
     path = Path(source)
-    start = read_bytes(path, LARGEST_LOG)[:20]
+    data = read_bytes(path, LARGEST_LOG)
     with raised_as(ConfigError, f"{path}: not a log that can be read"):
         for magic, (name, read) in READERS.items():
-            if start.startswith(magic):
-                return _recording(path, name, *read(path))
-        table, headers = _csv(path)
+            if data.startswith(magic):
+                return _recording(path, name, *read(path, data))
+        table, headers = _csv(path, data)
         name = next((name for name, mark in MARKS.items() if mark in table), "plain CSV")
         return _recording(path, name, [table], headers)
 
@@ -106,7 +106,7 @@ def _units(headers: StrDict) -> StrDict:
     return units
 
 
-def _ulog(path: Path) -> tuple[list[Part], StrDict]:
+def _ulog(path: Path, _data: bytes) -> tuple[list[Part], StrDict]:
     pyulog = require("pyulog", "fit", f"{path}: reading a ULog")
     parts: list[Part] = []
     for data in pyulog.ULog(str(path), disable_str_exceptions=True).data_list:
@@ -118,7 +118,7 @@ def _ulog(path: Path) -> tuple[list[Part], StrDict]:
     return parts, {}
 
 
-def _blackbox(path: Path) -> tuple[list[Part], StrDict]:
+def _blackbox(path: Path, _data: bytes) -> tuple[list[Part], StrDict]:
     orangebox = require("orangebox", "fit", f"{path}: reading a blackbox log")
     parser = orangebox.Parser.load(str(path))
     rows: list[Any] = []
@@ -131,9 +131,8 @@ def _blackbox(path: Path) -> tuple[list[Part], StrDict]:
     return [dict(table.apply(pd.to_numeric, errors="coerce"))], parser.headers
 
 
-def _usd(path: Path) -> tuple[list[Part], StrDict]:
+def _usd(_path: Path, data: bytes) -> tuple[list[Part], StrDict]:
     """Read what tools/usdlog of crazyflie-firmware reads."""
-    data = read_bytes(path, LARGEST_LOG)
     version, kinds = struct.unpack_from("<HH", data, 1)
     # Version 1 counts milliseconds, version 2 microseconds.
     time, scale = {1: ("<I", 1.0), 2: ("<Q", 1e-3)}[version]
@@ -165,16 +164,16 @@ def _usd(path: Path) -> tuple[list[Part], StrDict]:
     return parts, {}
 
 
-READERS: Mapping[bytes, tuple[str, Callable[[Path], tuple[list[Part], StrDict]]]] = {
+READERS: Mapping[bytes, tuple[str, Callable[[Path, bytes], tuple[list[Part], StrDict]]]] = {
     b"ULog\x01\x12\x35": ("PX4", _ulog),
     b"H Product:Blackbox": ("Betaflight", _blackbox),
     b"\xbc": ("Crazyflie", _usd),
 }
 
 
-def _csv(path: Path) -> tuple[Part, StrDict]:
+def _csv(path: Path, data: bytes) -> tuple[Part, StrDict]:
     """Return the table of a CSV file, and the names and values above it."""
-    lines = read_bytes(path, LARGEST_LOG).split(b"\n", 400)[:-1]
+    lines = data.split(b"\n", 400)[:-1]
     # Betaflight's Explorer writes the headers of the log above the names of the columns.
     skipped = next((k for k, line in enumerate(lines) if b"loopIteration" in line), 0)
     headers = {}
