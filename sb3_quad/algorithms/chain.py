@@ -1,8 +1,9 @@
 """The chain of wrappers between an agent and the simulator: what it changes, and what is unknown.
 
-This is the only place that looks into wrappers. Those of Gymnasium and Stable-Baselines3 are known
-by name. Any other that touches observations or actions may change both, unless its class says what
-it changes by an attribute ``changes``, such as ``changes = ""`` for a reward of your own.
+This is the only place that looks into wrappers. Those of Gymnasium, Stable-Baselines3, its contrib
+and rl_zoo3 are known by name. Any other that touches observations or actions may change both,
+unless its class says what it changes by an attribute ``changes``, such as ``changes = ""`` for a
+reward of your own.
 """
 
 import copy
