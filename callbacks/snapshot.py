@@ -14,7 +14,6 @@ import numpy as np
 import torch as th
 from pydantic import TypeAdapter
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -31,8 +30,6 @@ Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
 # Prefix of the environments' arrays.
 ENVIRONMENT = "environment."
-# Fill counters of a model's stores, which keep rows beyond a rollout.
-COUNTERS = {"dataset": ("added",), "replay_buffer": ("pos", "full")}
 # By name: value, sample count, excluded formats.
 LOG = TypeAdapter(dict[str, tuple[float, int, tuple[str, ...]]])
 NO_BYTES = np.zeros(0, np.uint8)
@@ -40,8 +37,6 @@ NO_BYTES = np.zeros(0, np.uint8)
 ANY_LENGTH = ("model", "best_model", "random", "log")
 # Share of the run's time that snapshots may take.
 SHARE = 0.03
-# Seconds between two snapshots of an off-policy algorithm, whose rollouts are short.
-PAUSE = 1.0
 
 
 class SnapshotFile(BaseCallback):
@@ -66,6 +61,7 @@ class SnapshotFile(BaseCallback):
     :param signals: a received signal ends the training as soon as the snapshot can be completed.
     :param episodes: a log of the training, whose length belongs to the snapshot.
     :param best_model: a file that belongs to the snapshot.
+    :raises ConfigError: an algorithm with a replay buffer, when training begins.
     :raises TrainingError: parameters that are no longer finite; the snapshot is then from before
         that update.
     """
@@ -88,10 +84,13 @@ class SnapshotFile(BaseCallback):
         self._episodes = Path(episodes)
         self._best_model = Path(best_model)
         self._state: Arrays = {}
-        self._next_taken = -np.inf  # s
         self._next_write = -np.inf  # s
 
     def _on_training_start(self) -> None:
+        if isinstance(self.model, OffPolicyAlgorithm):
+            raise ConfigError(
+                "SnapshotFile: replay buffers are no part of it; use SB3's CheckpointCallback"
+            )
         # Restore pending log values, so that a resumed run logs what an uninterrupted one would.
         # Without reset_num_timesteps=False, the training is a new one.
         if self.num_timesteps == 0 or not self._path.is_file():
@@ -103,19 +102,9 @@ class SnapshotFile(BaseCallback):
             self.logger.name_to_excluded[name] = excluded
 
     def _on_step(self) -> bool:
-        if not self._signals.received:
-            return True
-        # In the first step after a snapshot, a replay buffer has nothing yet that would be lost.
-        # Until then, the training continues.
-        first_step = self._state["timesteps"] + self.training_env.num_envs
-        return isinstance(self.model, OffPolicyAlgorithm) and self.num_timesteps != first_step
+        return not self._signals.received
 
     def _on_rollout_start(self) -> None:
-        start = time.monotonic()
-        is_early = isinstance(self.model, OffPolicyAlgorithm) and start < self._next_taken
-        if is_early and not self._signals.received:
-            return
-        self._next_taken = start + PAUSE
         self._take()
         start = time.monotonic()
         if self._every > 0 and start >= self._next_write:
@@ -144,8 +133,8 @@ class SnapshotFile(BaseCallback):
                 )
         model = io.BytesIO()
         self.model.save(model)
-        # The rows of the stores are read when the snapshot is written. A rollout later there are
-        # more, and the oldest of a full store are replaced; the resumed training adds the same rows
+        # The rows of the dataset are read when the snapshot is written. A rollout later there are
+        # more, and the oldest of a full one are replaced; the resumed training adds the same rows
         # again before it reads any.
         self._state = {
             **_surroundings(self.training_env, self.model),
@@ -163,9 +152,7 @@ class SnapshotFile(BaseCallback):
 
         :raises ConfigError: a folder that cannot be written, a full disk.
         """
-        arrays: StrDict = dict(self._state)
-        for name, store in _stores(self.model).items():
-            arrays |= _filled(name, store)
+        arrays: StrDict = {**self._state, **_rows(self.model)}
         write_arrays(self._path, **arrays)
 
     def save_model(self, path: StrPath) -> str:
@@ -181,7 +168,7 @@ def restore(
 ) -> tuple[Algorithm, Arrays]:
     """Load the model of a snapshot, ready for ``learn(…, reset_num_timesteps=False)``.
 
-    Its stores, the environments and all random numbers continue where they were.
+    Its dataset, the environments and all random numbers continue where they were.
 
     :param keywords: passed to ``load``, such as ``device``, and ``expert``, which no zip contains.
     :return: the model, and the arrays of the snapshot.
@@ -220,8 +207,7 @@ def _restore(
     _check(state, {"timesteps": np.array(0), **_surroundings(env, model)})
     _require(int(state["episodes"]) >= 0, "episodes is negative")
     _require(model.num_timesteps == state["timesteps"], "timesteps is not that of model")
-    for name, store in _stores(model).items():
-        _fill(name, store, state)
+    _fill_dataset(model, state)
     environment = {
         name.removeprefix(ENVIRONMENT): array
         for name, array in state.items()
@@ -239,8 +225,8 @@ def _restore(
 
 
 def _surroundings(env: VecEnv, model: Any) -> Arrays:
-    """Return random states, environments and fill counters of the stores, and placeholders for the
-    log and the files.
+    """Return random states, environments and the dataset's counter, and placeholders for the log
+    and the files.
     """
     state = {
         **random_state(),
@@ -252,9 +238,8 @@ def _surroundings(env: VecEnv, model: Any) -> Arrays:
     if batch is not None:
         for name, array in batch.snapshot().items():
             state[f"{ENVIRONMENT}{name}"] = array
-    for name, store in _stores(model).items():
-        for counter in COUNTERS[name]:
-            state[f"{name}.{counter}"] = np.array(getattr(store, counter))
+    if hasattr(model, "dataset"):
+        state["dataset.added"] = np.array(model.dataset.added)
     return state
 
 
@@ -286,39 +271,21 @@ def _batch(env: VecEnv) -> Any:
     return None if env is not env.unwrapped else getattr(env, "batch", None)
 
 
-def _stores(model: Any) -> StrDict:
-    """Return what a model keeps beyond a rollout, by name."""
-    return {
-        name: getattr(model, name) for name in COUNTERS if getattr(model, name, None) is not None
-    }
+def _rows(model: Any) -> Arrays:
+    """Return views of the filled rows of a model's dataset, by name; none without a dataset."""
+    if not hasattr(model, "dataset"):
+        return {}
+    return {f"dataset.{key}": array for key, array in model.dataset.filled.items()}
 
 
-def _filled(name: str, store: Any) -> Arrays:
-    """Return views of the filled rows of a dataset or a replay buffer, by name."""
-    if not isinstance(store, ReplayBuffer):
-        arrays = store.filled
-    elif isinstance(store.observations, dict):
-        raise ConfigError("replay buffers of Dict observations are not part of a snapshot")
-    else:
-        # The memory-efficient variant keeps the last next observation in one more row.
-        rows = store.size() + 1
-        arrays = {
-            key: array[:rows] for key, array in vars(store).items() if isinstance(array, np.ndarray)
-        }
-    return {f"{name}.{key}": array for key, array in arrays.items()}
-
-
-def _fill(name: str, store: Any, state: Arrays) -> None:
-    """Put a snapshot's rows into a store."""
-    for counter in COUNTERS[name]:
-        value = state[f"{name}.{counter}"].item()
-        _require(
-            0 <= value < getattr(store, "buffer_size", np.inf),
-            f"{name}.{counter} is beyond its rows",
-        )
-        setattr(store, counter, value)
-    for key, rows in _filled(name, store).items():
-        # Arrays that were written after the counters may have more rows.
+def _fill_dataset(model: Any, state: Arrays) -> None:
+    """Put a snapshot's rows into a model's dataset, if it has one."""
+    if hasattr(model, "dataset"):
+        added = state["dataset.added"].item()
+        _require(added >= 0, "dataset.added is negative")
+        model.dataset.added = added
+    for key, rows in _rows(model).items():
+        # Arrays that were written after the counter may have more rows.
         if key in state and state[key].ndim:
             state[key] = state[key][: len(rows)]
         _check(state, {key: rows})

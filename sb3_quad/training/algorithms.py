@@ -27,8 +27,6 @@ ALGORITHMS = {
     "ppo_bc": "sb3_quad.algorithms.ppo_bc:PPOBC",
     "apg": "sb3_quad.algorithms.apg:APG",
     "ppo": "stable_baselines3.ppo.ppo:PPO",
-    "sac": "stable_baselines3.sac.sac:SAC",
-    "td3": "stable_baselines3.td3.td3:TD3",
 }
 BASES = {
     "callback": BaseCallback,

@@ -14,12 +14,10 @@ import gymnasium
 from pydantic import (
     BeforeValidator,
     Field,
-    NonNegativeFloat,
     PositiveInt,
     model_validator,
 )
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_quad.agents.agent_settings import agent_settings, settings_of_model, unlike_trained
 from sb3_quad.agents.pretrained import agent_path, pretrained_names
@@ -108,10 +106,6 @@ class TrainingConfig(Frozen):
     """wrappers around the vectorised environment"""
     normalize: bool | Keywords = False
     """true, or keywords of SB3's VecNormalize, which then is the outermost wrapper"""
-    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
-    """action noise, for off-policy algorithms"""
-    noise_std: NonNegativeFloat = 0.1
-    """standard deviation of the action noise; actions are in [-1, 1]"""
     hyperparams: StrDict
     """keywords of the algorithm's constructor, converted"""
     settings: StrDict = Field(repr=False)
@@ -161,26 +155,9 @@ class TrainingConfig(Frozen):
         return [*self.vec_env_wrapper, (NORMALIZE, keywords)]
 
     @property
-    def is_off_policy(self) -> bool:
-        """Whether the algorithm learns from a replay buffer, such as SAC.
-
-        Its rollouts are ``train_freq`` steps long.
-        """
-        return issubclass(self.algorithm, OffPolicyAlgorithm)
-
-    @property
     def rollout_steps(self) -> int:
-        """Control steps of each environment between two updates.
-
-        1 if ``train_freq`` counts episodes.
-        """
-        if not self.is_off_policy:
-            return int(self.keyword("n_steps"))
-        train_freq = self.keyword("train_freq")
-        if isinstance(train_freq, int):
-            return train_freq
-        number, unit = train_freq
-        return int(number) if unit == "step" else 1
+        """Control steps of each environment between two updates."""
+        return int(self.keyword("n_steps"))
 
     @property
     def rollout(self) -> int:
@@ -195,8 +172,6 @@ class TrainingConfig(Frozen):
         n_steps = -(-self.n_timesteps // self.n_envs)
         if n_steps >= self.rollout_steps:
             return {}
-        if self.is_off_policy:
-            return {"train_freq": n_steps}
         if "batch_size" not in constructor_parameters(self.algorithm):
             return {"n_steps": n_steps}
         rollout = n_steps * self.n_envs
@@ -238,10 +213,7 @@ class TrainingConfig(Frozen):
     @model_validator(mode="after")
     def _algorithm_fits(self) -> "TrainingConfig":
         if self.rollout_steps < 1:
-            key = "train_freq" if self.is_off_policy else "n_steps"
-            raise ConfigError(f"{key} is {self.keyword(key)}, must be at least 1")
-        if self.noise_type and not self.is_off_policy:
-            raise ConfigError(f"noise_type: {self.algo} samples its actions; remove noise_type")
+            raise ConfigError(f"n_steps is {self.rollout_steps}, must be at least 1")
         if self.expert and not takes_expert(self.algorithm):
             raise ConfigError(f"expert: {self.algo} does not learn from an expert; remove expert")
         return self
@@ -316,8 +288,7 @@ def load_config(
     """Read the settings of ``env_id`` from a YAML file and apply ``overrides`` to them.
 
     They are merged as by :func:`merged`. If ``n_timesteps`` is less than a rollout, ``n_steps`` is
-    reduced to it and ``batch_size`` to at most that; for an off-policy algorithm, ``train_freq``
-    is.
+    reduced to it and ``batch_size`` to at most that.
 
     :param conf_file: path of a file, or the name of one that comes with the package such as
         ``thesis/dagger.yml``; None for ``<algo>.yml`` of the package.
@@ -489,8 +460,7 @@ def as_agent(agent: BaseAlgorithm, config: TrainingConfig, changes: StrMapping) 
         "env_kwargs": {**config.env_kwargs, **observed, **changes.get("env_kwargs", {})},
         "eval_env_kwargs": {"position_integral": integral, **config.eval_env_kwargs},
     }
-    # The actor of an off-policy algorithm imitates the agent, so its networks may differ.
-    if "policy_kwargs" not in changes and not config.is_off_policy:
+    if "policy_kwargs" not in changes:
         policy: Any = agent.policy
         adopted["policy_kwargs"] = {
             **config.policy_kwargs,

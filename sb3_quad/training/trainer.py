@@ -21,7 +21,6 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
-from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
@@ -60,7 +59,6 @@ from sb3_quad.training.runs import (
 )
 from sb3_quad.training.snapshots import load_snapshot
 
-NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
 NEVER = 2**62  # timesteps
 OWN_TASK = ""  # the name of evaluations on the task of the training
 
@@ -194,9 +192,6 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     """
     config = job.config
     keywords = copy.deepcopy(config.hyperparams) | _expert(config)
-    if config.noise_type:
-        zeros = np.zeros(env.action_space.shape or ())
-        keywords["action_noise"] = NOISES[config.noise_type](zeros, zeros + config.noise_std)
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
     keywords |= job.model_dump(include={"seed", "device", "verbose", "tensorboard_log"})

@@ -32,7 +32,7 @@ import sb3_quad.training.snapshots
 from sb3_quad.cli import main
 from sb3_quad.envs import QuadcopterVecEnv
 
-RUNS = ("dagger", "ppo_bc", "pipeline", "evaluate", "ppo", "sac")
+RUNS = ("dagger", "ppo_bc", "pipeline", "evaluate", "ppo")
 TINY = {
     "n_timesteps": 8000,
     "n_envs": 16,
@@ -43,15 +43,7 @@ TINY = {
     "policy_kwargs": {"net_arch": [16]},
 }
 DAGGER = {**TINY, "dataset_capacity": 4000, "gradient_steps": 5}  # a ring that has been round
-OFF_POLICY = {
-    **{key: TINY[key] for key in ("n_envs", "env_kwargs", "policy_kwargs")},
-    "n_timesteps": 4000,
-    "learning_starts": 400,
-    "train_freq": 5,
-    "buffer_size": 2000,
-    "batch_size": 64,
-}
-SETTINGS = {"dagger": DAGGER, "sac": OFF_POLICY}
+SETTINGS = {"dagger": DAGGER}
 # Where the next folder of a kind gets the next number.
 NUMBERED = r"(Quad[A-Za-z]+-v0|pipeline)_\d+"
 SUITE = """

@@ -83,7 +83,7 @@ CONF_FILE: Flags = {
 }
 SETTINGS_FLAGS: Flags = {
     "--algo": (
-        f"algorithm of a single run: {DEFAULT_ALGO} (default), ppo_bc, apg, ppo, sac or td3"
+        f"algorithm of a single run: {DEFAULT_ALGO} (default), ppo_bc, apg or ppo"
     ),
     "--env": (
         f"environment id ({DEFAULT_ENV}); "
