@@ -1,8 +1,9 @@
 """PyBullet's part of ``QuadcopterEnv``: the rigid body, and pictures of its flight."""
 
-import time
 import weakref
 from collections.abc import Callable
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -10,12 +11,6 @@ from sb3_quad.base.types import FloatArray, Image
 from sb3_quad.envs.rendering.bullet_client import p
 from sb3_quad.envs.rendering.camera import MARGIN, WIDE, Lens, chasing, framing_camera
 from sb3_quad.envs.rendering.picture import draw, relative_size
-from sb3_quad.envs.rendering.scene import Scene
-from sb3_quad.envs.rendering.window import (
-    Client,
-    point_window,
-    start_drawing,
-)
 from sb3_quad.envs.simulation.physics import rotation_rows, to_body
 from sb3_quad.envs.simulation.state import (
     BODY_RATES,
@@ -31,9 +26,29 @@ from sb3_quad.envs.vehicles.vehicle import Vehicle
 
 Air = Callable[[int, FloatArray], FloatArray]
 RENDER_MODES = ("human", "rgb_array")
-# PyBullet's window makes the simulation wait for each frame, so it draws only this many per second.
-WINDOW_FPS = 25.0
 _ORIGIN = (0.0, 0.0, 0.0)
+
+
+class Client:
+    """PyBullet's functions, bound to a new simulation: ``client.stepSimulation()`` is
+    ``p.stepSimulation(physicsClientId=client.number)``.
+    """
+
+    def __init__(self) -> None:
+        self.number = int(p.connect(p.DIRECT))
+        if self.number < 0:
+            raise p.error("no connection")
+
+    def __getattr__(self, name: str) -> Any:
+        function = partial(getattr(p, name), physicsClientId=self.number)
+        # Kept, so that each function is looked up once.
+        vars(self)[name] = function
+        return function
+
+    def close(self) -> None:
+        """End the simulation, unless it has ended already."""
+        if self.isConnected():
+            self.disconnect()
 
 
 class BulletBody:
@@ -44,10 +59,10 @@ class BulletBody:
     decides about contact with the ground by the position.
 
     :param vehicle: mass, inertia, gravity and physics step.
-    :param client: belongs to this body from now on.
     """
 
-    def __init__(self, vehicle: Vehicle, client: Client) -> None:
+    def __init__(self, vehicle: Vehicle) -> None:
+        client = Client()
         self.client = client
         # The number of PyBullet's clients is limited, so this one is also closed if the object is
         # garbage-collected without close(), and when the interpreter exits.
@@ -72,7 +87,7 @@ class BulletBody:
 
     @property
     def connected(self) -> bool:
-        """Whether the simulation exists: it was not closed, and its window was not shut."""
+        """Whether the simulation has not been closed."""
         return self._close.alive and bool(self.client.isConnected())
 
     def place(self, state: QuadcopterState) -> None:
@@ -134,21 +149,12 @@ class Renderer:
 
     :param width: width of the pictures, pixels.
     :param height: height of the pictures, pixels.
-    :param body: the simulation.
-    :param human: whether it has a window, into which this draws in real time.
     """
 
-    def __init__(
-        self, vehicle: Vehicle, width: int, height: int, body: BulletBody, human: bool
-    ) -> None:
+    def __init__(self, vehicle: Vehicle, width: int, height: int) -> None:
         self.vehicle = vehicle
-        self.scene = Scene(vehicle, body.client) if human else None
         self.lens = Lens(width, height, WIDE)
-        self.shown_at = time.perf_counter()
-        self.frames_due = 1.0
         self.reset(np.zeros(TARGET.stop))
-        if self.scene is not None:
-            start_drawing(self.scene.client)
 
     def reset(self, state: FloatArray) -> None:
         """Begin an episode in ``state``, (STATE_SIZE,): the camera looks along the way to the
@@ -156,28 +162,10 @@ class Renderer:
         """
         self.forward = chasing(state[TARGET] - state[POSITION])
 
-    def render(self, state: FloatArray) -> Image | None:
-        """Draw a state, (STATE_SIZE,). Call it every control step.
-
-        :return: uint8 (height, width, 3). If there is a window, None: it shows WINDOW_FPS frames a
-            second, and this call waits until real time has caught up.
-        """
-        if self.scene is not None:
-            control_step = self.vehicle.control_step
-            # Wait for real time, but do not hurry after a step that took longer.
-            now = time.perf_counter()
-            self.shown_at = max(self.shown_at + control_step, now)
-            time.sleep(self.shown_at - now)
-            self.frames_due += WINDOW_FPS * control_step
-            if self.frames_due < 1.0:
-                return None
-            self.frames_due %= 1.0
+    def render(self, state: FloatArray) -> Image:
+        """Return the picture of a state, (STATE_SIZE,): uint8 (height, width, 3)."""
         # Vehicle and target must both be in the picture.
         both = np.stack([state[POSITION], state[TARGET]])
         margin = MARGIN * relative_size(self.vehicle)
         camera = framing_camera(both, margin, self.forward, self.lens)
-        if self.scene is None:
-            return np.array(draw(self.vehicle, state, camera))
-        self.scene.place(state[:, None])
-        point_window(self.scene.client, camera, state[POSITION])
-        return None
+        return np.array(draw(self.vehicle, state, camera))

@@ -14,12 +14,14 @@ from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, Image, StrDi
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
-from sb3_quad.envs.rendering.window import Client, has_display, open_window
+from sb3_quad.envs.rendering.window import Window, has_display
 from sb3_quad.envs.simulation.checks import check_size
 from sb3_quad.envs.simulation.settings import ENDLESS, AsList
 from sb3_quad.envs.simulation.state import POSITION, P
 from sb3_quad.envs.simulation.tasks import TaskSpec
 
+# Pictures that a window shows in a second of flight
+WINDOW_FPS = 25.0
 Vector = Annotated[tuple[float, float, float], AsList]
 Quaternion = Annotated[tuple[float, float, float, float], AsList]
 
@@ -183,8 +185,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     the current frame alone. To sample vehicles from a named distribution, give
     `vehicles={"distribution": "raptor"}`. A `reference` is the name of a curve,
     fields of `Reference`, the path of a CSV file or a function of time; it begins at the episode's
-    target. Render mode `"human"` opens a
-    real-time window, one per process; `"rgb_array"` makes pictures and needs no display.
+    target. Render mode `"human"` shows
+    the pictures of `"rgb_array"` in a real-time window; the latter needs no display.
 
     The classes are :class:`~sb3_quad.envs.simulation.tasks.Task`,
     :class:`~sb3_quad.envs.vehicles.vehicle.Vehicle`,
@@ -254,12 +256,15 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         """Begin a simulation, with a window or pictures if the render mode asks for them. Without a
         display no window opens, and a line on stderr says why.
         """
-        human = self.render_mode == "human" and has_display()
-        self._body = BulletBody(self.vehicle, open_window(*self._size) if human else Client())
-        self._renderer = None
-        if human or self.render_mode == "rgb_array":
-            self._renderer = Renderer(self.vehicle, *self._size, self._body, human)
-        elif self.render_mode == "human":
+        self._body = BulletBody(self.vehicle)
+        self._renderer = Renderer(self.vehicle, *self._size)
+        self._window = None
+        if self.render_mode != "human":
+            return
+        if has_display():
+            self._window = Window(*self._size)
+            self._frames_due = 0.0
+        else:
             sys.stderr.write(
                 "sb3_quad: DISPLAY is not set, so no window opens; "
                 "render_mode='rgb_array' makes pictures\n"
@@ -267,7 +272,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     def __getstate__(self) -> StrDict:
         """Return all but the simulation, which PyBullet can neither copy nor save."""
-        return {**vars(self), "_body": None, "_renderer": None}
+        return {**vars(self), "_body": None, "_window": None}
 
     def __setstate__(self, state: StrDict) -> None:
         """Resume the flight in a new simulation."""
@@ -281,8 +286,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         # Each episode may have another vehicle.
         self._body.become(self.batch.vehicles[:, 0])
         self._body.place(self.true_state())
-        if self._renderer is not None:
-            self._renderer.reset(self.batch.state[:, 0])
+        self._renderer.reset(self.batch.state[:, 0])
 
     def reset(
         self, *, seed: int | None = None, options: StrDict | None = None
@@ -310,13 +314,11 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             raise ConfigError(
                 f"position {position.tolist()}: touches the ground; z must exceed {radius:g} m"
             )
-        # The simulation was closed, or the user has shut its window.
         if not self._body.connected:
             self._open()
         self._place()
         self._has_begun = True
-        if self.render_mode == "human":
-            self._draw()
+        self._show()
         # The outcome that an info shows is that of the new episode.
         batch.clear_outcome()
         return self.observe(), self._info()
@@ -346,8 +348,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             self._body.fly(rotors, wrench, air)
             self._body.read(batch.state)
         observations, _, _ = batch.score(array[None])
-        if self.render_mode == "human":
-            self._draw()
+        self._show()
         info = self._info()
         return observations[0], float(batch.outcome["reward"][0]), not info["survival"], False, info
 
@@ -367,15 +368,24 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             )
         return self._draw() if self.render_mode == "rgb_array" else None
 
-    def _draw(self) -> Image | None:
-        if self._renderer is None:
-            return None
+    def _draw(self) -> Image:
         return self._renderer.render(self.batch.state[:, 0])
+
+    def _show(self) -> None:
+        """Draw into the window, if there is one and its next picture is due."""
+        if self._window is None or not self._window.is_open:
+            return
+        self._frames_due += WINDOW_FPS * self.vehicle.control_step
+        if self._frames_due >= 1.0:
+            self._frames_due %= 1.0
+            self._window.show(self._draw(), 1.0 / WINDOW_FPS)
 
     def close(self) -> None:
         """End the simulation; calling it twice is fine."""
         self._has_begun = False
         self._body.close()
+        if self._window is not None:
+            self._window.close()
 
     def observe(self) -> Float32Array:
         """Return the current observation, (observation size,).

@@ -11,7 +11,7 @@ import pytest
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.bullet import BulletBody
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
-from sb3_quad.envs.rendering.window import Client
+from sb3_quad.envs.rendering.window import Window
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 HOVER = np.zeros(4, dtype=np.float32)
@@ -90,6 +90,47 @@ def test_human_mode_without_a_display_still_flies(monkeypatch, capsys):
     env.close()
 
 
+@pytest.fixture
+def toolkit(monkeypatch):
+    """Let matplotlib draw into memory as if that were a window."""
+    from matplotlib import pyplot
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    pyplot.switch_backend("agg")
+    monkeypatch.setattr(FigureCanvasAgg, "required_interactive_framework", "none")
+    monkeypatch.setattr("matplotlib.figure.Figure.show", lambda figure: None)
+    monkeypatch.setenv("DISPLAY", ":0")
+
+
+def test_human_mode_shows_the_pictures_in_real_time(toolkit, monkeypatch):
+    shown = []
+    monkeypatch.setattr(Window, "show", lambda window, *what: shown.append(what))
+    env = QuadcopterEnv(render_mode="human", render_width=64, render_height=48)
+    env.reset(seed=0)
+    for _ in range(20):
+        env.step(HOVER)
+    env.close()
+    assert [seconds for _, seconds in shown] == [0.04] * 5
+    assert all(_orange(picture).any() for picture, _ in shown)
+
+
+def test_a_window_shows_what_it_is_given_until_it_is_closed(toolkit):
+    window = Window(64, 48)
+    picture = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
+    window.show(picture, 0.01)
+    window.figure.canvas.draw()
+    drawn = np.asarray(window.figure.canvas.buffer_rgba())[..., :3]
+    np.testing.assert_array_equal(drawn, picture)
+    assert window.is_open
+    window.close()
+    assert not window.is_open
+
+
+def test_a_window_needs_a_toolkit():
+    with pytest.raises(ConfigError, match="PyQt6"):
+        Window(64, 48)
+
+
 def test_render_without_a_mode_warns():
     env = QuadcopterEnv()
     env.reset(seed=0)
@@ -106,7 +147,7 @@ def test_bad_size_is_refused(size):
 
 def test_the_body_has_the_numbers_of_the_vehicle():
     vehicle = load_vehicle("itm")
-    body = BulletBody(vehicle, Client())
+    body = BulletBody(vehicle)
     mass, _, inertia, *at = body.client.getDynamicsInfo(body.body, -1)[:5]
     assert mass == vehicle.mass and tuple(inertia) == vehicle.inertia
     assert at == [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)]

@@ -11,7 +11,7 @@ import numpy as np
 from sb3_quad.base.types import FloatArray
 
 SLOPE = math.tan(math.radians(15.0))  # see Lens; small, so that distance hardly changes sizes
-WIDE = math.tan(math.radians(27.0))  # at most that of PyBullet's window
+WIDE = math.tan(math.radians(27.0))  # of a single vehicle
 MARGIN = 0.6  # around a vehicle and its target, m, for the default vehicle
 ASIDE = math.radians(9.0)  # between the direction to the target and that of a chasing camera
 STEEPEST = math.radians(70.0)  # elevation of a chasing camera's direction

@@ -1,97 +1,66 @@
-"""PyBullet's simulations and its window."""
+"""A window of matplotlib that shows pictures in real time."""
 
-import math
 import os
 import sys
-from functools import partial
-from typing import Any
+import time
 
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError, raised_as
-from sb3_quad.base.types import FloatArray
-from sb3_quad.envs.rendering.bullet_client import p
-from sb3_quad.envs.rendering.camera import Camera
+from sb3_quad.base.types import Image
 
-
-class Client:
-    """PyBullet's functions, bound to a new simulation: ``client.stepSimulation()`` is
-    ``p.stepSimulation(physicsClientId=client.number)``.
-
-    :param mode: ``p.DIRECT``, without a display, or ``p.GUI``.
-    """
-
-    def __init__(self, mode: int = p.DIRECT, **options: str) -> None:
-        self.number = int(p.connect(mode, **options))
-        if self.number < 0:
-            raise p.error("no connection")
-
-    def __getattr__(self, name: str) -> Any:
-        function = partial(getattr(p, name), physicsClientId=self.number)
-        # Kept, so that each function is looked up once.
-        vars(self)[name] = function
-        return function
-
-    def draw_ground(self) -> None:
-        """Add PyBullet's chequered ground, which nothing touches: vehicles have no shape that
-        collides with it.
-        """
-        import pybullet_data
-
-        plane = f"{pybullet_data.getDataPath()}/plane.urdf"
-        self.loadURDF(plane, useFixedBase=True, globalScaling=5.0)
-
-    def close(self) -> None:
-        """End the simulation, unless it has ended already, for example with its window."""
-        if self.isConnected():
-            self.disconnect()
+DPI = 100
 
 
 def has_display() -> bool:
-    """Whether a window can be opened; without a display PyBullet would end the whole process."""
+    """Whether a window can be opened."""
     return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
 
 
-def open_window(width: int, height: int) -> Client:
-    """Open PyBullet's window, without controls; it draws nothing until
-    :func:`start_drawing`.
+class Window:
+    """A window, open until it is closed or somebody shuts it.
 
-    :raises ConfigError: there is one already in this process, or it cannot be opened.
+    :param width: width of its pictures, pixels; ``height`` likewise.
+    :raises ConfigError: matplotlib cannot open one.
     """
-    sky = "--background_color_red=0.70 --background_color_green=0.82 --background_color_blue=0.93"
-    with raised_as(
-        ConfigError,
-        "render_mode 'human': PyBullet could not open its window, of which a process can have one; "
-        "use render_mode='rgb_array'",
-    ):
-        client = Client(p.GUI, options=f"--width={width} --height={height} {sky}")
-    # Only the scene is shown: no controls, no shortcuts, and nothing before start_drawing().
-    for option in (
-        p.COV_ENABLE_RENDERING,
-        p.COV_ENABLE_GUI,
-        p.COV_ENABLE_MOUSE_PICKING,
-        p.COV_ENABLE_KEYBOARD_SHORTCUTS,
-    ):
-        client.configureDebugVisualizer(option, 0)
-    return client
 
+    def __init__(self, width: int, height: int) -> None:
+        with raised_as(ConfigError, "matplotlib cannot open a window"):
+            # It takes half a second to import.
+            from matplotlib import pyplot
 
-def start_drawing(client: Client) -> None:
-    """Let a window show what is in it."""
-    client.configureDebugVisualizer(p.COV_ENABLE_RENDERING, 1)
+            size = (width / DPI, height / DPI)
+            self.figure = pyplot.figure(figsize=size, dpi=DPI, facecolor="black")
+            if self.figure.canvas.required_interactive_framework is None:
+                pyplot.close(self.figure)
+                raise ConfigError(
+                    "matplotlib has no toolkit for windows here: pip install PyQt6, or make a film "
+                    "or pictures"
+                )
+            self.figure.show()
+        axes = self.figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        axes.set_axis_off()
+        self._image = axes.imshow(np.zeros((height, width, 3), np.uint8))
+        self._due = time.perf_counter()
 
+    @property
+    def is_open(self) -> bool:
+        """Whether the window has not been shut."""
+        from matplotlib import pyplot
 
-def point_window(client: Client, camera: Camera, towards: FloatArray) -> None:
-    """Give a window the view of ``camera``, and draw it.
+        return bool(pyplot.fignum_exists(self.figure.number))
 
-    :param towards: the point that it looks at, (3,).
-    """
-    forward = camera.axes[0]
-    distance = np.linalg.norm(towards - camera.eye)
-    client.resetDebugVisualizerCamera(
-        cameraDistance=distance,
-        cameraYaw=math.degrees(math.atan2(forward[1], forward[0])) - 90.0,
-        cameraPitch=math.degrees(math.asin(forward[2])),
-        cameraTargetPosition=camera.eye + distance * forward,
-    )
-    client.configureDebugVisualizer(p.COV_ENABLE_SINGLE_STEP_RENDERING, 1)
+    def show(self, picture: Image, seconds: float) -> None:
+        """Show a picture, uint8 (height, width, 3), for some seconds since the one before."""
+        self._image.set_data(picture)
+        self.figure.canvas.draw_idle()
+        # Real time, without hurry after a picture that took longer.
+        now = time.perf_counter()
+        self._due = max(self._due + seconds, now + 0.001)
+        self.figure.canvas.start_event_loop(self._due - now)
+
+    def close(self) -> None:
+        """Close the window; calling it twice is fine."""
+        from matplotlib import pyplot
+
+        pyplot.close(self.figure)

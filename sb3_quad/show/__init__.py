@@ -1,1 +1,1 @@
-"""Flights to look at: films, sequences of poses in one picture, and PyBullet's window."""
+"""Flights to look at: films and windows."""

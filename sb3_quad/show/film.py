@@ -1,10 +1,7 @@
-"""Recorded flights in motion: a film with a panel for each, or PyBullet's window with all vehicles
-together, in real time.
-"""
+"""Recorded flights in motion: a film with a panel for each, or a window that shows it."""
 
 import tempfile
-import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +12,9 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray, Image, StrDict
-from sb3_quad.envs.rendering.bullet_client import p
-from sb3_quad.envs.rendering.camera import MARGIN, WIDE, Camera, Lens, framing_camera
+from sb3_quad.envs.rendering.camera import MARGIN, Camera, Lens, framing_camera
 from sb3_quad.envs.rendering.picture import draw, relative_size
-from sb3_quad.envs.rendering.scene import Scene
-from sb3_quad.envs.rendering.window import open_window, point_window, start_drawing
+from sb3_quad.envs.rendering.window import Window
 from sb3_quad.envs.simulation.state import POSITION, TARGET
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.show.episodes import Episode, Recording, outlook
@@ -136,41 +131,15 @@ def _panel(
         yield np.asarray(picture)
 
 
-def show_in_window(episodes: Sequence[Episode], width: int, height: int, speed: float) -> None:
-    """Show episodes one after the other, until the window is shut; flights of an episode start
-    together.
+def show_in_window(frames: Iterable[Image], width: int, height: int) -> None:
+    """Show the frames of a film in real time, until the window is shut.
 
+    :param width: width of a frame, pixels; ``height`` likewise.
     :raises ConfigError: the window cannot be opened.
     """
-    client = open_window(width, height)
-    try:
-        # Add all bodies before the window draws, since it would show each one as it is added.
-        n = len(episodes[0])
-        vehicle = episodes[0][0].vehicle
-        scene = Scene(vehicle, client, n)
-        start_drawing(client)
-        for recordings in episodes:
-            _play(scene, vehicle, recordings, Lens(width, height, WIDE), speed)
-    except p.error:
-        # PyBullet also raises when somebody shuts the window; that is how this ends.
-        if client.isConnected():
-            raise
-    finally:
-        client.close()
-
-
-def _play(scene: Scene, vehicle: Vehicle, recordings: Episode, lens: Lens, speed: float) -> None:
-    forward = outlook(recordings)
-    begun = time.perf_counter()
-    for number, seconds in enumerate(frame_times(recordings, speed)):
-        # The frames follow the clock, so that flights are shown in real time: each waits for its
-        # time, and those that would come too late are skipped.
-        early = begun + number / FPS - time.perf_counter()
-        if early < -1.0 / FPS:
-            continue
-        time.sleep(max(0.0, early))
-        states = [recording.state.array[:, recording.at(seconds)] for recording in recordings]
-        together = np.stack(states, axis=1)
-        scene.place(together)
-        camera = following_camera(together, vehicle, forward, lens)
-        point_window(scene.client, camera, together[POSITION].mean(axis=1))
+    window = Window(width, height)
+    for frame in frames:
+        if not window.is_open:
+            return
+        window.show(frame, 1.0 / FPS)
+    window.close()

@@ -3,7 +3,7 @@ r"""Watch controllers fly, in a window or as a film.
 Several controllers fly the same episodes side by side.
 
 examples:
-  # the agent of the latest run, in PyBullet's window
+  # the agent of the latest run, in a window
   sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs
   # the best agent of run 2
   sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 --exp-id 2 --load-best
@@ -125,12 +125,13 @@ def run(options: Namespace) -> int:
             prefix = f"episode {number}, " if len(episodes) > 1 else ""
             print(f"{prefix}{flight.name}: {flight.end}, reward {flight.flights.reward[0]:.2f}")
     width, height = options.size or (PANEL if len(controllers) > 1 else SINGLE)
+    films = (film_frames(episode, width, height, options.speed) for episode in episodes)
+    frames = chain.from_iterable(films)
     if window:
-        show_in_window(episodes, width, height, options.speed)
+        show_in_window(frames, width * len(controllers), height)
     elif options.output:
         with console.status("drawing"):
-            frames = (film_frames(episode, width, height, options.speed) for episode in episodes)
-            write_film(Path(options.output), chain.from_iterable(frames))
+            write_film(Path(options.output), frames)
         print("saved", options.output)
     return 0
 

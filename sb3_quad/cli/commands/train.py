@@ -82,9 +82,7 @@ CONF_FILE: Flags = {
     ),
 }
 SETTINGS_FLAGS: Flags = {
-    "--algo": (
-        f"algorithm of a single run: {DEFAULT_ALGO} (default), ppo_bc, apg or ppo"
-    ),
+    "--algo": (f"algorithm of a single run: {DEFAULT_ALGO} (default), ppo_bc, apg or ppo"),
     "--env": (
         f"environment id ({DEFAULT_ENV}); "
         "any id that Gymnasium knows, with --vec-env dummy or subproc"
