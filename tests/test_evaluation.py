@@ -1,6 +1,4 @@
-"""Flights: what is measured is the true flight of the episodes that were asked for, in either
-environment.
-"""
+"""Flights: what is measured is the true flight of the episodes that were asked for."""
 
 import tracemalloc
 
@@ -8,10 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from sb3_quad import load_pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation import statistics
-from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly
+from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.following import FOLLOWED
 from sb3_quad.evaluation.hover import HOVERED
 from sb3_quad.evaluation.metric_tables import SUCCESS, metric_cells, metric_rows
@@ -21,8 +18,6 @@ from sb3_quad.evaluation.statistics import bootstrap, mean, share
 from sb3_quad.evaluation.tables import Table
 from sb3_quad.experts.pid import PIDExpert
 
-BACKENDS = ("batch", "pybullet")
-
 
 def fall(observation):
     return -np.ones((len(observation), 4), dtype=np.float32)
@@ -30,22 +25,6 @@ def fall(observation):
 
 def hover(observation):
     return np.zeros((len(observation), 4), dtype=np.float32)
-
-
-def same(a, b):
-    for name in ("success", "survival", "length"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-    for name in ("reward", "path_length", "final_error"):
-        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=1e-6)
-    for tolerance in TOLERANCES:
-        np.testing.assert_allclose(a.time_to[tolerance], b.time_to[tolerance], atol=1e-9)
-
-
-def test_pybullet_flies_what_each_row_has():
-    rows = {"vehicle": ["crazyflie", "itm"], "noise": [0.1, 0.0], "max_episode_steps": 60}
-    rows["observation_std"] = np.outer([1.0, 2.0], np.ones(18))
-    expert = load_pretrained("itm-recovery")
-    same(*(fly(expert, "state_recovery", 2, backend=backend, **rows) for backend in BACKENDS))
 
 
 def test_metrics_are_those_of_the_environment():

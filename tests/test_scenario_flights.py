@@ -1,6 +1,4 @@
-"""Flights of scenarios: the same in either environment, and physics where it can be said
-beforehand.
-"""
+"""Flights of scenarios: physics where it can be said beforehand."""
 
 import numpy as np
 import pytest
@@ -25,10 +23,10 @@ def hover(observation):
     return np.zeros((len(observation), 4), dtype=np.float32)
 
 
-def recorded(controller, flown, m, backend="batch"):
+def recorded(controller, flown, m):
     """Return the flights of a scenario, and the trajectories of the first m."""
     recorder = Recorder(m)
-    flights = fly_scenario(controller, flown, backend, [recorder])
+    flights = fly_scenario(controller, flown, [recorder])
     return flights, recorder.arrays()
 
 
@@ -45,42 +43,6 @@ class OnObservations:
 
     def predict(self, observation, deterministic=True):
         return self.expert.predict(observation)
-
-
-MIXED = (
-    "start: {tilt: 70, velocity: {magnitude: 2}}, task_kwargs: {body_rates_std: 2},"
-    "waypoints: [[0, 0, 16], [1, 0, 17], [0, 2, 16]], waypoint_radius: 1.0, "
-    "duration: 3, n_episodes: 2,"
-    "randomize: {mass: 1.1, inertia: 1.2, motor_gain: 0.8, delay: 2},"
-    "wrenches: [{start: 1, duration: 0.5, force: {magnitude: 5}, force_frame: body},"
-    "{start: 1.2, duration: 0.1, force: [3, 0, 0], torque: [0.1, 0, 0.2], torque_frame: world}]"
-)
-RECOVERY = "task: state_recovery, duration: 2, n_episodes: 3"
-GUSTS = (
-    "task_kwargs: {target_distance: 3}, duration: 2, n_episodes: 2, "
-    "randomize: {mass: [0.9, 1.1], gusts: {std: 2, time_constant: 0.5}}"
-)
-
-
-@pytest.mark.parametrize(
-    ("entry", "controller"),
-    [(MIXED, OnObservations()), (RECOVERY, PIDExpert()), (GUSTS, PIDExpert())],
-    ids=["mixed, on observations", "recovery", "gusts"],
-)
-def test_both_backends_fly_the_same(entry, controller):
-    batch, one = recorded(controller, scenario(entry), 2)
-    bullet, two = recorded(controller, scenario(entry), 2, "pybullet")
-    for name, ours in vars(batch).items():
-        theirs = getattr(bullet, name)
-        if isinstance(ours, dict):
-            ours = np.stack([*ours.values()])
-            theirs = np.stack([*theirs.values()])
-        np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5, err_msg=name)
-    # q and -q are one attitude
-    same = np.sign(np.nansum(one["quaternion"] * two["quaternion"], axis=2, keepdims=True))
-    two["quaternion"] = two["quaternion"] * same
-    for name, values in one.items():
-        np.testing.assert_allclose(values, two[name], rtol=1e-3, atol=1e-4, err_msg=name)
 
 
 def test_gusts_push_and_the_suite_of_changes_flies():

@@ -11,9 +11,9 @@ from sb3_quad.base.errors import MissingExtra
 from sb3_quad.cli import main
 
 ROOT = Path(__file__).resolve().parent.parent
-ON_PYBULLET = ("base.bullet", "envs.bullet", "envs.quadcopter_env", "envs.rendering", "show")
+ON_PYBULLET = ("envs.bullet", "envs.quadcopter_env", "envs.rendering.bullet_client")
 NEEDS_PYBULLET = tuple(f"sb3_quad.{name}" for name in ON_PYBULLET)
-LINE = "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc, enjoy) needs pybullet "
+LINE = "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc) needs pybullet "
 
 
 def modules():
@@ -62,18 +62,13 @@ def without_pybullet(monkeypatch):
     )
 
 
-@pytest.mark.parametrize(
-    "command",
-    [
-        "enjoy pid --no-render",
-        "train --algo ppo --vec-env subproc -n 100 --n-envs 2",
-    ],
-)
 def test_a_command_that_needs_it_says_so_in_one_line(
-    without_pybullet, tmp_path, monkeypatch, capsys, command
+    without_pybullet, tmp_path, monkeypatch, capsys
 ):
     monkeypatch.chdir(tmp_path)
-    assert main(command.split()) == 2
+    assert (
+        main(["train", "--algo", "ppo", "--vec-env", "subproc", "-n", "100", "--n-envs", "2"]) == 2
+    )
     (said,) = capsys.readouterr().err.splitlines()
     assert said.startswith(f"error: {LINE}") and said.endswith(
         "pip install '.[pybullet]' from a clone of sb3_quad"

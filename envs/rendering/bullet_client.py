@@ -8,7 +8,7 @@ import os
 
 from sb3_quad.base.imports import require
 
-NEEDS = "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc, enjoy)"
+NEEDS = "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc)"
 
 
 # PyBullet writes to file descriptor 2 without sys.stderr.

@@ -147,21 +147,20 @@ def _flown_before(folder: Path, results: Results) -> list[Entry]:
 def fly_scenario(
     controller: Any,
     scenario: Scenario,
-    backend: str = "batch",
     hooks: Sequence[Hook] = (),
     own: StrMapping | None = None,
 ) -> Flights:
-    """Fly a scenario's episodes; the same ones for every controller and either backend.
+    """Fly a scenario's episodes; the same ones for every controller.
 
-    :param controller: as for :func:`~sb3_quad.evaluation.flights.fly`, like ``backend``.
+    :param controller: as for :func:`~sb3_quad.evaluation.flights.fly`.
     :param own: settings that go with the controller: its ``FlightSettings.observed``.
-    :raises ConfigError: an unknown backend, or a controller of an unknown kind.
+    :raises ConfigError: a controller of an unknown kind.
     :raises ControllerError: a controller that fails in flight.
     """
     seeds = scenario.episode_seeds()
     settings = scenario.settings.with_changes(**(own or {}))
     plan = sample_plan(scenario, seeds)
-    return fly_settings(controller, settings, seeds, backend, scenario.tolerances, hooks, plan)
+    return fly_settings(controller, settings, seeds, scenario.tolerances, hooks, plan)
 
 
 def _fly(spec: ControllerSpec, scenario: Scenario) -> tuple[Entry, Arrays]:

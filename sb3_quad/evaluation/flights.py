@@ -7,7 +7,6 @@ whole episode of 15 s, not only of the way until arrival.
 
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.algorithms.controller import Controller
 from sb3_quad.algorithms.labelling import refuse_other_action, warn_of_vehicle
 from sb3_quad.algorithms.networks import one_thread_by_default
-from sb3_quad.base.errors import ConfigError, ControllerError, refuse_unknown
+from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import (
@@ -41,7 +40,7 @@ from sb3_quad.envs.simulation.checks import per_row, whole_number
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.simulation.state import TARGET
 from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
-from sb3_quad.evaluation.fleets import FLEETS
+from sb3_quad.evaluation.fleets import Fleet
 from sb3_quad.evaluation.following import Following
 from sb3_quad.evaluation.hooks import Arrivals, Course, Hook, Motion
 from sb3_quad.evaluation.hover import HOVERED, Hover
@@ -125,7 +124,6 @@ def fly(
     seed: int = 0,
     vehicle: str | Vehicle | None = None,
     noise: float = 0.05,
-    backend: str = "batch",
     tolerances: Sequence[float] | float = TOLERANCES,
     hooks: Sequence[Hook] = (),
     record: StrPath | None = None,
@@ -146,13 +144,11 @@ def fly(
         :func:`~sb3_quad.env_kwargs`; you are warned where it differs.
     :param vehicle: None: the one that the agent was trained on, else ``itm``. The agent flies in
         the ``rotor_layout`` of its own, unless you give another.
-    :param backend: ``batch``, or ``pybullet`` for the reference.
     :param tolerances: of arrival, |r - r_T|, m; one or several.
     :param hooks: are called along the way.
     :param record: an ``.npz`` file for the observations and actions of all control steps, which
         ``DAgger(demonstrations=...)`` and ``dataset.load`` take; an existing one is replaced.
-    :raises ConfigError: an unknown name, backend or keyword, a seed below 0, or fewer than one
-        episode.
+    :raises ConfigError: an unknown name or keyword, a seed below 0, or fewer than one episode.
     :raises ControllerError: a controller of another kind, or one that fails in flight.
     """
     seeds = episode_seeds(seed, n_episodes)
@@ -177,7 +173,7 @@ def fly(
     environment.setdefault("max_episode_steps", MAX_EPISODE_STEPS)
     settings = FlightSettings().with_changes(task=task, vehicle=flown, noise=noise, **environment)
     warn_of_differences(name, controller, settings)
-    return fly_settings(controller, settings, seeds, backend, limits, hooks, record=record)
+    return fly_settings(controller, settings, seeds, limits, hooks, record=record)
 
 
 def warn_of_differences(name: str, controller: Any, settings: FlightSettings) -> None:
@@ -211,7 +207,6 @@ def fly_settings(
     controller: Any,
     settings: FlightSettings,
     seeds: Sequence[int],
-    backend: str = "batch",
     tolerances: Sequence[float] = TOLERANCES,
     hooks: Sequence[Hook] = (),
     plan: Plan | None = None,
@@ -224,7 +219,6 @@ def fly_settings(
     :param plan: the events of the episodes.
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
     """
-    refuse_unknown("backend", [backend], FLEETS)
     limit = settings.max_episode_steps
     if isinstance(limit, list):
         raise ConfigError(f"max_episode_steps {limit}: must be one number, for all flights")
@@ -233,7 +227,8 @@ def fly_settings(
     refuse_other_action(type(controller).__name__, controller, settings.action)
     seen: list[Float32Array] = []
     done: list[Float32Array] = []
-    with closing(FLEETS[backend](seeds, settings)) as fleet, one_thread_by_default():
+    fleet = Fleet(seeds, settings)
+    with one_thread_by_default():
         observations, _ = quadcopter_spaces(fleet.observation.size)
         pilot = Controller(
             controller, ACTIONS, observations, fleet.estimated_state, deterministic=deterministic

@@ -1,4 +1,4 @@
-"""Recorded flights to be shown: the same episodes for all controllers, on PyBullet."""
+"""Recorded flights to be shown: the same episodes for all controllers."""
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
@@ -165,7 +165,6 @@ def fly_all(
                     controller,
                     own,
                     [seed],
-                    "pybullet",
                     hooks=[recording],
                     plan=setting.plan(seed),
                     deterministic=deterministic,

@@ -1,6 +1,4 @@
-"""Sample the events of a scenario's episodes from their seeds, the same for every controller and
-backend.
-"""
+"""Sample the events of a scenario's episodes from their seeds, the same for every controller."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
