@@ -94,7 +94,7 @@ def test_the_physical_limit_is_that_of_each_agents_vehicle(here):
 def test_table_results_and_flights_agree(here, capsys):
     assert evaluate("pid", "still=my_controllers:hover") == 0
     text = capsys.readouterr().out
-    for part in ("pid", "still", "paper: expert", "2 to 3", "tilt 60"):
+    for part in ("pid", "still", "paper: expert", "2 to 3", "60, success"):
         assert part in text
     results = load_results("out")
     assert [record.label for record in results.controllers] == ["pid", "still"]

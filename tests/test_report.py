@@ -10,8 +10,8 @@ from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import Row
-from sb3_quad.evaluation.plots import paths_plot, success_plot
-from sb3_quad.evaluation.report import _cells, write_report
+from sb3_quad.evaluation.plots import paths_plot
+from sb3_quad.evaluation.report import write_report
 from sb3_quad.evaluation.results import load_results
 from sb3_quad.evaluation.scenarios.load import parse_suite
 from sb3_quad.evaluation.tables import Table
@@ -68,7 +68,7 @@ def test_the_report_holds_the_results_and_no_html(folder):
 def test_every_plot_is_shown_in_the_report(folder):
     text = (folder / "report.md").read_text(encoding="utf-8")
     files = {path.name for path in (folder / "figures").iterdir()}
-    names = ("tracking_paths", "upside_down_paths", "drop_0")
+    names = ("tracking_paths", "upside_down_paths")
     assert files == {f"{name}.png" for name in names}
     for file in files:
         assert f"](figures/{file})" in text
@@ -86,16 +86,6 @@ def test_plots_are_of_the_flights(folder):
         np.testing.assert_array_equal(lines[0].get_xydata()[0], tracks[0].position[0, columns])
         # It is lost, which a cross marks.
         assert "X" in [line.get_marker() for line in axes.lines]
-    legends_cover_nothing(figure)
-
-
-def test_success_is_drawn_over_what_varies(folder):
-    results = load_results(folder)
-    cells = _cells(results, [each for each in results.scenarios if each.group == "drop"])
-    figure = success_plot(cells, "randomize.delay", "delay", results.colours)
-    for line, label in zip(figure.axes[0].lines, ("pid", LABEL), strict=True):
-        metrics = [results.entry(label, f"drop.{delay}").metrics for delay in (0, 90)]
-        np.testing.assert_allclose(line.get_ydata(), [each.success.value for each in metrics])
     legends_cover_nothing(figure)
 
 

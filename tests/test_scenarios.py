@@ -15,7 +15,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.simulation.state import QuadcopterState
 from sb3_quad.envs.simulation.vehicle_distribution import DISTRIBUTIONS
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
-from sb3_quad.evaluation.scenarios.load import SUITES, axis_name, load_suite, parse_suite
+from sb3_quad.evaluation.scenarios.load import SUITES, load_suite, parse_suite
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import Suite
 
@@ -70,8 +70,8 @@ def test_the_thesis_suite_holds_all_of_chapter_four():
         ("randomize: {force: [0, 1]}, wrenches: [{force: [1, 0, 0]}]", "randomize"),
         ("wrenches: [{start: 14.996}]", "wrenches.0"),
         ("wrenches: [{duration: 0.001}]", "wrenches.0"),
-        ("vary: {noise: [0, 0]}", "vary.noise"),
-        ("vary: {noise: [true, false]}", "vary.noise"),
+        ("vary: {noise: [true, false]}", "vary"),
+        ("vary: {noise: 0.1}", "vary"),
         ("vary:", "vary"),
         ("vary: {noise.level: [0, 1]}, noise: 0.1", "vary.noise.level"),
     ],
@@ -112,9 +112,10 @@ def test_vary_is_a_grid_of_named_cells():
     cells = suite("title: grid, vary: {noise: [0, 0.1], start.tilt: [0, 45, 90]}").scenarios
     assert len({cell.name for cell in cells}) == 6
     for cell in cells:
-        assert cell.group == "s"
-        assert cell.cell == {"noise": cell.noise, "start.tilt": cell.start.tilt}
-    assert axis_name("randomize.gusts.std") == "gusts"
+        assert cell.group == "s" and cell.heading == "Grid"
+        assert cell.name == f"s.{cell.noise:g}_{cell.start.tilt:g}"
+    with pytest.raises(ConfigError, match=r"s\.1"):
+        suite("vary: {noise: [1, 1]}")
 
 
 @pytest.mark.parametrize(

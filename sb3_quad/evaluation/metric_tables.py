@@ -11,7 +11,6 @@ from sb3_quad.evaluation.hooks import arrival_tolerance
 from sb3_quad.evaluation.hover import HOVERED
 from sb3_quad.evaluation.metrics import Metrics, Moment
 from sb3_quad.evaluation.results import Results
-from sb3_quad.evaluation.scenarios.load import axis_values
 from sb3_quad.evaluation.scenarios.scenario import Printed, Published, Scenario
 from sb3_quad.evaluation.statistics import Estimate
 from sb3_quad.evaluation.tables import Table
@@ -89,6 +88,8 @@ ROWS = {
     **dict(zip(FOLLOWED, FOLLOWING, strict=True)),
 }
 CAPTION = "in brackets: 95 % intervals"
+# Beyond, the cells of a grid have a row each.
+MANY_CELLS = 12
 
 Cells = Mapping[Row, str]
 
@@ -175,14 +176,19 @@ def _printed(row: Row, value: Printed) -> str:
 
 
 def metric_rows(
-    scenario: Scenario, measured: Sequence[Cells], published: Sequence[Published] = ()
+    scenario: Scenario,
+    measured: Sequence[Cells],
+    published: Sequence[Published] = (),
+    n_cells: int = 1,
 ) -> list[list[str]]:
     """Return the rows of a scenario for a :class:`~sb3_quad.evaluation.tables.Table`: controllers
     first, then published columns. Rows that no controller has are not shown.
+
+    :param n_cells: scenarios that share the table.
     """
     columns = [*measured, *map(published_cells, published)]
     rows = []
-    for row in _rows_of(scenario):
+    for row in _rows_of(scenario, n_cells):
         if any(row in cells for cells in measured):
             rows.append([row.heading, *(cells.get(row, "") for cells in columns)])
     return rows
@@ -191,13 +197,13 @@ def metric_rows(
 def overview(results: Results) -> list[Table]:
     """Return the tables of all scenarios; the last one says how to read them."""
     tables = []
-    for heading, scenarios in scenario_groups(results):
-        tables.append(group_table(results, heading, scenarios))
+    for scenarios in scenario_groups(results):
+        tables.append(group_table(results, scenarios))
     tables[-1] = tables[-1]._replace(caption=CAPTION)
     return tables
 
 
-def group_table(results: Results, heading: str, scenarios: Sequence[Scenario]) -> Table:
+def group_table(results: Results, scenarios: Sequence[Scenario]) -> Table:
     """Return the table of a scenario, or of the cells that ``vary`` makes of one."""
     rows = []
     for scenario in scenarios:
@@ -211,35 +217,31 @@ def group_table(results: Results, heading: str, scenarios: Sequence[Scenario]) -
             if entry.physical_limit is not None:
                 cells[LIMIT] = LIMIT.number(entry.physical_limit)
             measured.append(cells)
-        for name, *texts in metric_rows(scenario, measured, [*scenario.published.values()]):
-            rows.append([", ".join([*axis_values(scenario.cell), name]), *texts])
-    published = [f"{results.source}: {name}" for name in scenarios[0].published]
-    return Table(["", *results.colours, *published], rows, heading)
+        _, _, cell = scenario.name.partition(".")
+        published = [*scenario.published.values()]
+        for name, *texts in metric_rows(scenario, measured, published, len(scenarios)):
+            rows.append([", ".join(filter(None, [cell, name])), *texts])
+    columns = [f"{results.source}: {name}" for name in scenarios[0].published]
+    return Table(["", *results.colours, *columns], rows, scenarios[0].heading)
 
 
-def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
-    """Return each scenario, or the cells that ``vary`` makes of one, with its heading."""
-    groups = []
-    for _, members in groupby(results.scenarios, lambda scenario: scenario.group or scenario.name):
-        scenarios = list(members)
-        heading = scenarios[0].heading
-        if scenarios[0].group:
-            heading = heading.rsplit(":", 1)[0]  # without the values of the cell
-        groups.append((heading[:1].upper() + heading[1:], scenarios))
-    return groups
+def scenario_groups(results: Results) -> list[list[Scenario]]:
+    """Return each scenario, or the cells that ``vary`` makes of one, in a list."""
+    groups = groupby(results.scenarios, lambda scenario: scenario.group)
+    return [[*members] for _, members in groups]
 
 
-def _rows_of(scenario: Scenario) -> list[Row]:
+def _rows_of(scenario: Scenario, n_cells: int) -> list[Row]:
     """The rows that have a meaning in a scenario."""
     shares = [SUCCESS, SURVIVAL]
     errors = [MEDIAN, QUANTILE, *HOVER]
     if scenario.waypoints:
         return [*shares, REACHED, COMPLETED, COURSE_TIME, *HOVER]
-    if len(scenario.cell) > 1:
+    if n_cells > MANY_CELLS:
         return [SUCCESS]
     if scenario.reference is not None:
         return [*shares, REWARD, *FOLLOWING]
-    if scenario.group is not None:
+    if n_cells > 1:
         return [*shares, MEDIAN, *HOVER]
     # An episode that starts at its target does not fly to it.
     if not scenario.has_way:

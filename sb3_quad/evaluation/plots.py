@@ -1,13 +1,10 @@
-"""Plots of flights, and of success over a varied quantity, in one style."""
+"""Plots of flights, in one style."""
 
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import matplotlib
-import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_quad.base.files import write_bytes
@@ -20,7 +17,6 @@ HEIGHT = 3.3
 DPI = 150
 SHOWN_FLIGHTS = 4  # of a controller, from above and from the side
 TARGET = "#1a9a45"
-POINTS: Any = {"marker": "o", "markersize": 3.5}  # on curves through few of them
 STYLE = matplotlib.rc_params_from_file(
     Path(__file__).with_name("plots.mplstyle"), use_default_template=False
 )
@@ -61,32 +57,6 @@ def paths_plot(flights: Flights, colours: Colours) -> Figure:
                     axes.plot(*path[-1], "X", color=colours[label], markersize=9)
     legend(figure)
     return figure
-
-
-@styled
-def success_plot(cells: pd.DataFrame, key: str, title: str, colours: Colours) -> Figure:
-    """Draw success over a quantity that a scenario varies: the mean over the other quantities, in a
-    band from the least to the greatest.
-
-    :param cells: success of each controller, a column by its label, over the varied quantities.
-    :param key: the quantity; ``title``: of its axis.
-    """
-    figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
-    axes = figure.subplots()
-    axes.set(xlabel=title, ylabel="success")
-    for label in cells:
-        shares = cells[label].dropna().groupby(key).agg(["mean", "min", "max"])
-        band(axes, colours[str(label)], str(label), shares, **POINTS)
-    axes.set_ylim(-0.03, 1.03)
-    legend(figure)
-    return figure
-
-
-def band(axes: Axes, colour: str, label: str, table: pd.DataFrame, **style: Any) -> None:
-    """Draw a line and the band around it over the index of a table: value, low and high."""
-    middle, low, high = table.to_numpy().T
-    axes.plot(table.index, middle, color=colour, label=label, **style)
-    axes.fill_between(table.index, low, high, color=colour, alpha=0.16, linewidth=0)
 
 
 def legend(figure: Figure) -> None:

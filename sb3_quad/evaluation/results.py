@@ -59,7 +59,7 @@ class Entry(Frozen):
 class Results(Frozen):
     """A folder of results."""
 
-    schema_version: Literal[11] = 11
+    schema_version: Literal[12] = 12
     suite: str
     title: str = ""
     """of the suite"""

@@ -1,28 +1,27 @@
 """Suites of scenarios from YAML files: those of the package by name, your own by path.
 
-With ``vary``, one scenario in the file becomes a grid of scenarios, for heat maps and sweeps.
+With ``vary``, one scenario in the file becomes a grid of scenarios. Their names begin with its own
+and a dot.
 """
 
 import copy
 import itertools
-import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from pydantic import Field, StrictFloat, StrictInt
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import put_key
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
-from sb3_quad.base.validate import validate
+from sb3_quad.base.validate import check, validate
 from sb3_quad.base.yaml_files import YamlFolder, parse_keys
 from sb3_quad.envs.vehicles.vehicle import VEHICLES
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
 
 SUITES = YamlFolder("suite", "sb3_quad.evaluation.scenarios.suites")
-# The types that the values of an axis may have.
-NUMBERS = ({int}, {float}, {int, float})
-# Parts of a key that its short name does not need.
-_SILENT = {"magnitude", "std", "value"}
+Values = Annotated[list[StrictInt | StrictFloat], Field(min_length=1)]
+Axes = Annotated[dict[str, Values], Field(min_length=1)]
 
 
 def load_suite(source: StrPath) -> Suite:
@@ -70,8 +69,6 @@ def _beside(folder: Path, value: Any) -> Any:
 def grid(entry: StrMapping, where: str) -> list[StrDict]:
     """Return the scenarios of one entry: a cell for each combination of the values in ``vary``.
 
-    Without ``vary``, this is only the entry itself.
-
     :param entry: as read from YAML; ``vary`` maps keys such as ``start.tilt`` to lists of
         numbers.
     :raises ConfigError: ``vary`` is not such a mapping, or a key of it is not in the entry.
@@ -79,42 +76,13 @@ def grid(entry: StrMapping, where: str) -> list[StrDict]:
     if "vary" not in entry:
         return [dict(entry)]
     plain = dict(entry)
-    axes = plain.pop("vary")
-    if not isinstance(axes, dict) or not axes:
-        raise ConfigError(
-            f"{where}: vary must map keys to lists of numbers, such as 'noise: [0, 0.05, 0.1]'"
-        )
-    for key, values in axes.items():
-        # A bool is an int to Python, but not a number to a reader.
-        numbers = isinstance(values, list) and {*map(type, values)} in NUMBERS
-        if not numbers or len({*values}) < len(values) or not all(map(math.isfinite, values)):
-            raise ConfigError(
-                f"{where}: vary.{key} must be a list of different numbers, not {values!r}"
-            )
+    axes = check(Axes, plain.pop("vary"), f"{where}: vary")
     cells = []
     for values in itertools.product(*axes.values()):
         # Keys may lead into nested parts, which the cells must not share.
         cell = copy.deepcopy(plain)
-        varied = dict(zip(map(str, axes), values, strict=True))
-        for key, value in varied.items():
+        for key, value in zip(axes, values, strict=True):
             put_key(cell, key, value, f"{where}: vary.{key}")
-        name = plain.get("name")
-        cell |= {
-            "cell": varied,
-            "group": name,
-            "title": f"{plain.get('title') or name}: {', '.join(axis_values(varied))}",
-            "name": f"{name}.{'_'.join(map('{:g}'.format, values))}",
-        }
+        cell["name"] = f"{plain.get('name')}.{'_'.join(map('{:g}'.format, values))}"
         cells.append(cell)
     return cells
-
-
-def axis_name(key: str) -> str:
-    """Return the short name of a varied key: ``start.body_rates.magnitude`` is ``body_rates``."""
-    parts = [part for part in key.split(".") if part not in _SILENT and not part.isdigit()]
-    return parts[-1] if parts else key
-
-
-def axis_values(cell: Mapping[str, float]) -> list[str]:
-    """Return the short names of varied keys, each with its value."""
-    return [f"{axis_name(key)} {value:g}" for key, value in cell.items()]

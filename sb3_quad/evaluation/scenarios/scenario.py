@@ -119,10 +119,6 @@ class Scenario(Frozen):
     """of arrival, |r - r_T|, m"""
     published: dict[str, Published] = {}
     """published metrics, by column title"""
-    group: str | None = None
-    """the scenario that this one is a cell of; set by vary"""
-    cell: dict[str, float] = {}
-    """this cell's values, by key; set by vary"""
 
     @field_validator("vehicle")
     @classmethod
@@ -221,9 +217,15 @@ class Scenario(Frozen):
         return row_seeds(seed_for("suite", self.seed), self.n_episodes)
 
     @property
+    def group(self) -> str:
+        """The name until its first dot: what the cells that ``vary`` makes share."""
+        return self.name.partition(".")[0]
+
+    @property
     def heading(self) -> str:
-        """The title, or the name."""
-        return self.title or self.name
+        """The title, or the name, of the scenario or its group."""
+        text = self.title or self.group
+        return text[:1].upper() + text[1:]
 
     @property
     def steps(self) -> int:
@@ -318,7 +320,7 @@ class Suite(Frozen):
         known = set[str]()
         changed = []
         for scenario in self.scenarios:
-            own = {scenario.name, scenario.group or scenario.name}
+            own = {scenario.name, scenario.group}
             known |= own
             if not names or own & {*names}:
                 changed.append(scenario.changed(changes))
