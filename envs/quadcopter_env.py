@@ -263,7 +263,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             return
         if has_display():
             self._window = Window(*self._size)
-            self._frames_due = 0.0
+            self._frames_due = 1.0  # the first one at once
         else:
             sys.stderr.write(
                 "sb3_quad: DISPLAY is not set, so no window opens; "

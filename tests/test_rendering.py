@@ -110,7 +110,7 @@ def test_human_mode_shows_the_pictures_in_real_time(toolkit, monkeypatch):
     for _ in range(20):
         env.step(HOVER)
     env.close()
-    assert [seconds for _, seconds in shown] == [0.04] * 5
+    assert [seconds for _, seconds in shown] == [0.04] * 6
     assert all(_orange(picture).any() for picture, _ in shown)
 
 

@@ -9,7 +9,7 @@ import itertools
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, StrictFloat, StrictInt
+from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import put_key
@@ -20,7 +20,7 @@ from sb3_quad.envs.vehicles.vehicle import VEHICLES
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
 
 SUITES = YamlFolder("suite", "sb3_quad.evaluation.scenarios.suites")
-Values = Annotated[list[StrictInt | StrictFloat], Field(min_length=1)]
+Values = Annotated[list[int | float], Field(min_length=1)]
 Axes = Annotated[dict[str, Values], Field(min_length=1)]
 
 
@@ -76,7 +76,7 @@ def grid(entry: StrMapping, where: str) -> list[StrDict]:
     if "vary" not in entry:
         return [dict(entry)]
     plain = dict(entry)
-    axes = check(Axes, plain.pop("vary"), f"{where}: vary")
+    axes = check(Axes, plain.pop("vary"), f"{where}: vary", strict=True)
     cells = []
     for values in itertools.product(*axes.values()):
         # Keys may lead into nested parts, which the cells must not share.
