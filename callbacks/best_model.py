@@ -231,19 +231,13 @@ class _Evaluations:
         """
         if not self.path.is_file():
             return
-        arrays = read_arrays(self.path)
-        results = arrays.get("results", ())
-        if len(results) == 0:
-            raise ConfigError(f"{self.path}: cannot be read (results: no such array, or empty)")
-        flown = len(results[-1])
+        self.rows = read_rows(self.path)
+        flown = len(self.rows[-1]["results"])
         if flown != n_episodes:
             raise ConfigError(
                 f"{self.path}: evaluations of {flown} episodes; "
                 f"n_episodes (--eval-episodes) must be {flown}"
             )
-        self.rows = [
-            dict(zip(arrays, row, strict=True)) for row in zip(*arrays.values(), strict=False)
-        ]
 
     def append(self, row: StrDict) -> None:
         """Add an evaluation and write the file.
@@ -257,6 +251,18 @@ class _Evaluations:
             nothing = np.full(np.shape(value), np.nan)
             arrays[name] = [row.get(name, nothing) for row in self.rows]
         write_arrays(self.path, **arrays)
+
+
+def read_rows(path: Path) -> list[StrDict]:
+    """Return the evaluations in a file, at least one, each as arrays by name.
+
+    :raises ConfigError: it cannot be read.
+    """
+    arrays = read_arrays(path)
+    rows = [dict(zip(arrays, row, strict=True)) for row in zip(*arrays.values(), strict=False)]
+    if not rows or "results" not in rows[0]:
+        raise ConfigError(f"{path}: cannot be read (results: no such array, or empty)")
+    return rows
 
 
 def _vectorised(env: GymEnv) -> VecEnv:

@@ -216,7 +216,7 @@ def test_a_run_is_found_by_algorithm_environment_and_number(run_folder, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "key"),
     [
-        ([], "CONTROLLER"),
+        ([], "controller"),
         (["pdi", "--no-render"], "'pid'"),
         (["pid", "--env", "Pendulum-v1", "--no-render"], "rl_zoo3"),
         (["pid", "--task", "state-recovery", "--no-render"], "'state_recovery'"),

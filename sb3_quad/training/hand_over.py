@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_quad.base.files import read_arrays
 from sb3_quad.base.types import AnyArray, StrDict
-from sb3_quad.callbacks.best_model import RATES, score
+from sb3_quad.callbacks.best_model import RATES, read_rows, score
 from sb3_quad.training.runs import RunFolder
 
 # Standard errors: chance alone exceeds two in one comparison of forty.
@@ -40,8 +39,7 @@ def hand_over(run: RunFolder, best_by: str, wanted: str = "best") -> HandOver:
     """
     if not run.evaluations.is_file():
         return HandOver(run.model, {})
-    arrays = read_arrays(run.evaluations)
-    rows = [dict(zip(arrays, row, strict=True)) for row in zip(*arrays.values(), strict=True)]
+    rows = read_rows(run.evaluations)
     start, last = rows[0], rows[-1]
     has_start = start["timesteps"] == 0
     is_lower = has_start and is_below(last["results"], start["results"])
