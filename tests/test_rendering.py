@@ -118,8 +118,9 @@ def test_a_window_shows_what_it_is_given_until_it_is_closed(toolkit):
     window = Window(64, 48)
     picture = np.random.default_rng(0).integers(0, 256, (48, 64, 3), np.uint8)
     window.show(picture, 0.01)
-    window.figure.canvas.draw()
-    drawn = np.asarray(window.figure.canvas.buffer_rgba())[..., :3]
+    canvas: Any = window.figure.canvas
+    canvas.draw()
+    drawn = np.asarray(canvas.buffer_rgba())[..., :3]
     np.testing.assert_array_equal(drawn, picture)
     assert window.is_open
     window.close()
