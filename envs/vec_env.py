@@ -131,14 +131,15 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
     def _write_infos(self, infos: Infos, rows: npt.NDArray[np.intp]) -> None:
         """Write the infos of rows that have ended."""
         elapsed = round(time.time() - self._start, 6)
-        # Indexing copies, so that the next step does not change them.
-        outcomes = self.batch.outcome[rows].tolist()
-        observations = self.batch.last_observations[rows]
-        for row, outcome, observation in zip(rows.tolist(), outcomes, observations, strict=True):
-            total, _, length, distance, collision, out_of_range, truncated, success = outcome
+        batch = self.batch
+        for row in rows.tolist():
+            total, _, length, distance, collision, out_of_range, truncated, success = (
+                batch.outcome.item(row)
+            )
             # Not by a loop over ``INFOS``, which takes twice as long.
             infos[row] = {
-                "terminal_observation": observation,
+                # A copy, which the next step does not change
+                "terminal_observation": batch.last_observations[row].copy(),
                 "TimeLimit.truncated": truncated,
                 "episode": {"r": round(total, 6), "l": length, "t": elapsed},
                 "is_success": success,

@@ -238,7 +238,7 @@ def flight_vjp(b, states, gradient, grad_wanted, grad_speed, dt, substeps, in_ai
     for substep in range(substeps):
         states[substep, :MOVING] = b.state[:MOVING]
         states[substep, MOVING:] = b.filtered_rates
-        fly(b, dt, 1, in_air, by_rates)
+        fly(b, dt, 1, in_air, by_rates, True)
     states[substeps, :MOVING] = b.state[:MOVING]
     grad_wanted[:] = 0.0
     for substep in range(substeps - 1, -1, -1):

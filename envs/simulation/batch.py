@@ -327,9 +327,10 @@ class QuadcopterBatch:
         observations = np.empty_like(self.last_observations)
         rewards = np.empty(self.n, np.float32)
         dones = np.zeros(self.n, np.bool_)
-        dones[begins] = True
+        if begins.size:
+            dones[begins] = True
         results = observations, rewards, dones
-        arguments = self._arguments | changes
+        arguments = self._arguments | changes if changes else self._arguments
         self._is_behind = len(self.tracks) > 0
         if not share_out(step, self.helpers, mode, array, *results, *arguments.values()):
             row, _ = np.argwhere(~np.isfinite(array))[0]

@@ -13,7 +13,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import float32
+from numba import float32, int32
 
 from sb3_quad.base.compiled import LANES, atomic_add, called, compiled, inlined, inner
 from sb3_quad.envs.simulation.aerodynamics import scale_thrusts
@@ -254,6 +254,7 @@ def step(
     """
     n = state.shape[1]
     by_rates = filtered_rates.shape[1] > 0
+    may_push = in_air or gust.shape[1] + wind_gust.shape[1] + chances.size > 0
     chunks = (n + CHUNK - 1) // CHUNK
     if leads:
         if mode != LOOK and not _is_finite(actions):
@@ -297,20 +298,23 @@ def step(
             else:
                 load_rows(state, first, b.resting)
             if mode == FLY:
-                # Gusts and recordings add to what was set or sampled.
-                load_rows(wrench, first, b.wrench)
-                load_rows(wind, first, b.wind)
-                add_gusts(b.force_world, gust, first, count)
-                add_gusts(b.wind, wind_gust, first, count)
-                add_recording(
-                    b.wrench, wrench_record, wrench_starts, chances, streams, first, count
-                )
-                add_recording(b.wind, wind_record, wind_starts, chances, streams, first, count)
+                is_pushed = may_push or _acts(wrench, first, count) or _acts(wind, first, count)
+                if is_pushed:
+                    load_rows(wrench, first, b.wrench)
+                    load_rows(wind, first, b.wind)
+                if may_push:
+                    # Gusts and recordings add to what was set or sampled.
+                    add_gusts(b.force_world, gust, first, count)
+                    add_gusts(b.wind, wind_gust, first, count)
+                    add_recording(
+                        b.wrench, wrench_record, wrench_starts, chances, streams, first, count
+                    )
+                    add_recording(b.wind, wind_record, wind_starts, chances, streams, first, count)
                 _load_commands(b, first, count, actions, queue, by_rates)
                 if by_rates:
                     b.rate_command[:] = b.wanted_speeds
                     load_rows(filtered_rates, first, b.filtered_rates)
-                fly(b, physics_step, substeps, in_air, by_rates)
+                fly(b, physics_step, substeps, in_air, by_rates, is_pushed)
                 if by_rates:
                     save_rows(b.filtered_rates, first, count, filtered_rates)
                 save_rows(b.state[: X.target], first, count, state)
@@ -466,10 +470,22 @@ def new_block():
 @inner
 def _is_finite(actions):
     # Look at the bits: code compiled with fastmath may assume that no NaN exists.
-    wrong = 0
-    for bits in actions.view(np.int32).reshape(-1):
-        wrong += (bits & 0x7F800000) == 0x7F800000
-    return wrong == 0
+    bits = actions.view(np.int32).reshape(-1)
+    largest = int32(0)
+    for i in range(len(bits)):
+        largest = max(largest, bits[i] & int32(0x7F800000))
+    return largest < 0x7F800000
+
+
+@inner
+def _acts(source, first, count):
+    """Return whether a number of a block is not zero in a (rows, n) array."""
+    bits = source.view(np.int64)
+    found = np.int64(0)
+    for k in range(source.shape[0]):
+        for i in range(first, first + count):
+            found |= bits[k, i]
+    return found != 0
 
 
 @inner

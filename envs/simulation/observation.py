@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numba import float32
 
-from sb3_quad.base.compiled import LANES, fast, inlined
+from sb3_quad.base.compiled import LANES, fast, inlined, inner
 from sb3_quad.base.types import FloatArray
 from sb3_quad.envs.simulation.physics import rotation, to_body
 from sb3_quad.envs.simulation.random import OBSERVATION_NOISE, random_words, standard_normals
@@ -97,26 +97,28 @@ def features(b, moves):
 
     :param moves: whether references move or have a heading.
     """
-    _features_at_rest(b)
+    _features_at_rest(b, b)
     if moves:
         _relate(b)
         _turn(b)
 
 
-@fast
-def _features_at_rest(b):
+@inner(fastmath=True, forceinline=False)
+def _features_at_rest(b, out):
+    # The same block twice, and no part of the caller: LLVM cannot tell how far the numbers of two
+    # sizes that one pointer leads to lie apart, and would not vectorise the loop.
     for lane in range(LANES):
         r = rotation(b.quaternion, lane)
         v = to_body(r, vector(b.velocity, lane))
         offset = subtract(vector(b.position, lane), vector(b.target, lane))
-        store(b.observed_position, lane, offset)
+        store(out.observed_position, lane, offset)
         # From world to body: the columns of r
         x, y, z = transposed(r)
-        store(b.observed_rotation, lane, x)
-        store(b.observed_rotation[3:], lane, y)
-        store(b.observed_rotation[6:], lane, z)
-        store(b.observed_velocity, lane, v)
-        store(b.observed_body_rates, lane, vector(b.body_rates, lane))
+        store(out.observed_rotation, lane, x)
+        store(out.observed_rotation[3:], lane, y)
+        store(out.observed_rotation[6:], lane, z)
+        store(out.observed_velocity, lane, v)
+        store(out.observed_body_rates, lane, vector(b.body_rates, lane))
 
 
 @inlined

@@ -157,10 +157,16 @@ def moment(b, axis, lane):
 
 
 @inlined
-def _accelerate(b, lane, dt, in_air):
+def _push(rows, lane, is_pushed):
+    return vector(rows, lane) if is_pushed else (0.0, 0.0, 0.0)
+
+
+@inlined
+def _accelerate(b, lane, dt, in_air, is_pushed):
     """Advance rotor speeds, velocity and body rates of a lane by a physics step, in place.
 
-    :param in_air: a constant, whether the terms of :mod:`.aerodynamics` act.
+    :param in_air: a constant, whether the terms of :mod:`.aerodynamics` act; ``is_pushed``,
+        likewise, see :func:`fly`.
     """
     momentum = 0.0
     if in_air:
@@ -173,23 +179,23 @@ def _accelerate(b, lane, dt, in_air):
 
     # The force without gravity, first in the body frame. Drag is that of the airspeed.
     v = vector(b.velocity, lane)
-    airspeed = to_body(r, subtract(v, vector(b.wind, lane)))
+    airspeed = to_body(r, subtract(v, _push(b.wind, lane, is_pushed)))
     drag = multiply(vector(b.drag, lane), airspeed)
-    fx, fy, fz = subtract(vector(b.force_body, lane), drag)
+    fx, fy, fz = subtract(_push(b.force_body, lane, is_pushed), drag)
     total = 0.0
     if in_air:
         total = speed_sum(b.rotor_speeds, lane)
         fx, fy, fz = add((fx, fy, fz), air_force(b, airspeed, total, lane))
     force = to_world(r, (fx, fy, fz + total_thrust(b, lane)))
-    force = add(vector(b.force_world, lane), force)
+    force = add(_push(b.force_world, lane, is_pushed), force)
     fall = (0.0, 0.0, b.fall[lane])
     v = add(v, subtract(scaled(b.velocity_gain[lane], force), fall))
 
     # Euler's equations in the body frame
-    torque = to_body(r, vector(b.torque_world, lane))
+    torque = to_body(r, _push(b.torque_world, lane, is_pushed))
     w = vector(b.body_rates, lane)
     wx, wy, wz = w
-    in_body = vector(b.torque_body, lane)
+    in_body = _push(b.torque_body, lane, is_pushed)
     gyroscopic = multiply(vector(b.gyro, lane), (wy * wz, wz * wx, wx * wy))
     moments = moment(b, 0, lane), moment(b, 1, lane), moment(b, 2, lane)
     torque = add(torque, add(subtract(in_body, gyroscopic), moments))
@@ -205,10 +211,14 @@ def _accelerate(b, lane, dt, in_air):
 
 
 @fast
-def accelerate(b):
+def accelerate(b, is_pushed):
     """Advance rotor speeds, velocities and body rates by a physics step without air, in place."""
-    for lane in range(LANES):
-        _accelerate(b, lane, 1.0, False)
+    if is_pushed:
+        for lane in range(LANES):
+            _accelerate(b, lane, 1.0, False, True)
+    else:
+        for lane in range(LANES):
+            _accelerate(b, lane, 1.0, False, False)
 
 
 @inner(fastmath=True, forceinline=False)
@@ -217,7 +227,7 @@ def accelerate_in_air(b, dt):
     would then fly more slowly without air.
     """
     for lane in range(LANES):
-        _accelerate(b, lane, dt, True)
+        _accelerate(b, lane, dt, True, True)
 
 
 @fast
@@ -292,10 +302,11 @@ def move(b, dt):
 
 
 @inlined
-def fly(b, physics_step, substeps, in_air, by_rates):
+def fly(b, physics_step, substeps, in_air, by_rates, is_pushed):
     """Compute the physics steps of one control step of a loaded block, in place.
 
     :param by_rates: whether the rate loop commands the rotors.
+    :param is_pushed: whether a wrench or wind acts; otherwise neither has to be loaded.
     """
     for _ in range(substeps):
         if by_rates:
@@ -303,7 +314,7 @@ def fly(b, physics_step, substeps, in_air, by_rates):
         if in_air:
             accelerate_in_air(b, physics_step)
         else:
-            accelerate(b)
+            accelerate(b, is_pushed)
         if _may_exceed(b):
             limit_velocities(b)
         move(b, physics_step)

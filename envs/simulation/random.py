@@ -121,8 +121,9 @@ def _to_uniform(high, low):
 def random_words(b, purpose):
     """Write ``b.word``: random words of every lane, a multiple of 4, from its key and counter."""
     word = b.word
-    for block in range(word.shape[0] // 4):
-        for lane in range(LANES):
+    for lane in range(LANES):
+        # All blocks of a lane share its keys and their first round.
+        for block in range(word.shape[0] // 4):
             # Written out, since a loop over the four would not be vectorised.
             (
                 word[4 * block, lane],

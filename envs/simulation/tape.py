@@ -134,7 +134,8 @@ class FlightTape:
         """
         batch = self.batch
         t = self._at
-        self.states[t] = batch.state
+        if t == 0:
+            self.states[0] = batch.state
         self.actions[t] = actions
         self._integrals[t] = batch.integral
         self._estimates[t] = batch.estimate
@@ -145,10 +146,11 @@ class FlightTape:
         self._at = t + 1
         self.states[self._at] = batch.state
         newly_lost = ~batch.outcome["truncated"] & ~self.lost
-        self.lengths[newly_lost] = self._at
-        self.lost |= newly_lost
-        # Their episodes are over for later recordings, too, and for those of a resumed run.
-        batch.limits[newly_lost] = 0
+        if newly_lost.any():
+            self.lengths[newly_lost] = self._at
+            self.lost |= newly_lost
+            # Their episodes are over for later recordings, too, and for those of a resumed run.
+            batch.limits[newly_lost] = 0
         return observations
 
     @property

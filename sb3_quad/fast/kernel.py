@@ -16,6 +16,7 @@ from numba import float32, uint64
 from sb3_quad.base.compiled import compiled, inner
 from sb3_quad.base.types import Float32Array, IntArray
 from sb3_quad.fast.losses import actor_loss, critic_loss
+from sb3_quad.fast.tiles import HEIGHT, WIDTH, add_to_tile
 
 # Rows per block: loops are long, yet a layer of 64 units and its gradients fit into half a
 # megabyte.
@@ -25,6 +26,7 @@ LINEAR, TANH, RELU = range(3)
 _0, _1, _2, _3, _4 = (np.uint64(number) for number in range(5))
 # Inputs per tile, so that their rows stay in the L1 cache
 _TILE = np.uint64(16)
+_INPUTS = 32
 # Not "nnan": NaN and infinity must stay what they are
 _FAST = {"reassoc", "contract", "nsz"}
 # Beyond this, tanh is 1 in float32
@@ -44,31 +46,15 @@ class Layers(NamedTuple):
     parameters: Float32Array
 
 
-@inner(fastmath=_FAST)
-def _multiply(w, x, h, size):
+@inner
+def _multiply(w, x, h):
     """h = w x; w (rows, columns), x (columns, size), h (rows, size)."""
-    # Unsigned, since support for negative indices would cost a third.
-    rows = uint64(w.shape[0])
-    columns = uint64(w.shape[1])
-    for tile in range(_0, columns, _TILE):
-        for j in range(_0, rows, _2):
-            for k in range(tile, min(columns, tile + _TILE), _4):
-                a0, a1, a2, a3 = w[j, k], w[j, k + _1], w[j, k + _2], w[j, k + _3]
-                b0, b1, b2, b3 = (
-                    w[j + _1, k],
-                    w[j + _1, k + _1],
-                    w[j + _1, k + _2],
-                    w[j + _1, k + _3],
-                )
-                for i in range(size):
-                    x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
-                    one = a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
-                    other = b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
-                    if k > _0:
-                        one += h[j, i]
-                        other += h[j + _1, i]
-                    h[j, i] = one
-                    h[j + _1, i] = other
+    rows, columns = w.shape
+    for first in range(0, columns, _INPUTS):
+        last = min(columns, first + _INPUTS)
+        for j in range(0, rows, HEIGHT):
+            for i in range(0, x.shape[1], WIDTH):
+                add_to_tile(w, x, h, j, i, first, last)
 
 
 @inner(fastmath=_FAST)
@@ -197,7 +183,7 @@ def _forward(scratch, x, index, first, count, layers, size):
         at += columns * size
         middle = place + rows * columns
         h = _layer(scratch, at, rows, size)
-        _multiply(parameters[place:middle].reshape(rows, columns), before, h, size)
+        _multiply(parameters[place:middle].reshape(rows, columns), before, h)
         _activate(h, parameters[middle : middle + rows], kinds[layer - 1], size)
         place = middle + rows
     return at
@@ -235,7 +221,7 @@ def _backward(activations, scratch, layers, sums, last_layer, size):
         )
         if layer > last_layer:
             weights = parameters[place:middle].reshape(rows, columns)
-            _multiply(weights.T, g, _layer(scratch, there, columns, size), size)
+            _multiply(weights.T, g, _layer(scratch, there, columns, size))
             here, there = there, here
     return here
 

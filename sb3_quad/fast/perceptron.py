@@ -180,7 +180,10 @@ class Perceptron:
         """
         chunks = _chunks(n)
         threads = _threads if n > (WORTHWHILE - 1) * ROWS else 1
-        size = -(-chunks // (PARTS * threads)) if threads > 1 else chunks
+        if threads == 1:
+            function(0, chunks, chunks, _scratch(self._scratch_size), self._layers, *arguments)
+            return
+        size = -(-chunks // (PARTS * threads))
         # Each part goes to one thread only, since `next` holds Python's global lock.
         firsts = iter(range(0, chunks, size))
 
