@@ -220,7 +220,7 @@ def test_each_format_is_read_in_the_same_units_and_axes(table, tmp_path, write, 
     assert (log.order, log.kind, log.has_motion, log.step) == (order, "share", False, 0.005)
     rows = slice(20, 1100)
     np.testing.assert_allclose(log.motion[rows, -3:], table[GYRO_COLUMNS][rows], atol=accuracy)
-    np.testing.assert_allclose(log.force[rows], table["acc_z"][rows], atol=accuracy)
+    np.testing.assert_allclose(log.force[rows, 2], table["acc_z"][rows], atol=accuracy)
     commands = table[[f"share_{k}" for k in (1, 2, 3, 4)]][rows]
     np.testing.assert_allclose(log.mean_commands()[rows], commands, atol=accuracy)
 

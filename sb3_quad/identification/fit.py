@@ -31,7 +31,7 @@ HORIZONS = np.array([0.02, 0.05, 0.1]), np.array([0.05, 0.1, 0.2, 0.3, 0.5])
 HORIZONS_OF_RATES = np.arange(0.02, 0.11, 0.02), np.arange(0.02, 0.21, 0.02)
 WARM_UP = 0.25  # s
 SMOOTHED = 0.1  # s
-MOST_WINDOWS = 1500
+MOST_WINDOWS = 750
 # Of position, velocity, attitude, body rates and specific force, in the units of the motion: errors
 # of this size count as one in the first fit.
 ERRORS = (0.1, 0.4, 0.15, 0.4, 2.0)
@@ -98,12 +98,16 @@ class Model:
         errors = []
         for end, flown in zip(windows.ends, windows.fly(guess.vehicle, thrusts), strict=True):
             rows = windows.rows + end
-            force = flown[:, MOTION_SIZE:] - self.force[rows, None]
+            force = flown[:, MOTION_SIZE:] - self.force[rows]
             errors.append([*gaps(flown, windows.record[rows]), force])
         parts = [np.stack(one, axis=1) for one in zip(*errors, strict=True)]
         # The first body rate of a window is as noisy as the others: only changes count. Where the
         # airspeed is unknown, so are the moments of the air, which change slowly.
         parts[3] = detrend(parts[3], 1, "constant" if self.has_motion else "linear")
+        # An accelerometer is hardly mounted exactly. Without the airspeed, x and y say nothing.
+        parts[4][..., :2] -= parts[4][..., :2].mean(axis=(0, 1))
+        if not self.has_motion:
+            parts[4] = parts[4][..., 2:]
         return parts
 
     def residuals(self, vector: FloatArray) -> FloatArray:
@@ -116,10 +120,10 @@ class Model:
         return np.asarray(np.clip(known, -1e3, 1e3))
 
     def weigh(self, vector: FloatArray) -> None:
-        """Count errors by the size that they have now, each kind after each horizon."""
+        """Count errors by the size that they have now, each column after each horizon."""
         for number, part in enumerate(self.parts(vector)):
-            spread = 1.4826 * np.median(np.abs(part), axis=(0, 2))
-            self.sizes[number] = np.maximum(spread, 1e-3 * ERRORS[number])[:, None]
+            spread = 1.4826 * np.median(np.abs(part), axis=0)
+            self.sizes[number] = np.maximum(spread, 1e-3 * ERRORS[number])
 
     def solve(
         self, vector: FloatArray, free: IntArray, evaluations: int

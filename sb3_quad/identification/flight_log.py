@@ -61,7 +61,7 @@ class Log:
     step: float  #: from row to row, s
     #: (n, 13): position, quaternion, velocity and body rates, as the rows of the state have them
     motion: FloatArray
-    #: (n,), specific force along z, m/s²: the accelerometer's, or what follows from the motion
+    #: (n, 3), specific force, body axes, m/s²: the accelerometer's, or what the motion says
     force: FloatArray
     has_motion: bool  #: whether attitude and velocity are known, not the body rates alone
     flying: BoolArray  #: (n,), in the air
@@ -202,7 +202,7 @@ def on_grid(recording: Recording, step: float) -> Log:
         kind=kind,
         step=step,
         motion=motion,
-        force=force[:, 2],
+        force=force,
         has_motion=has_motion,
         flying=flying,
         times=times,
@@ -298,7 +298,10 @@ def _fill_motion(
 
     if flying.any():
         force = np.gradient(velocity, step, axis=0) + UPWARD
-        x, y, z = attitude.inv().apply(force)[flying].mean(axis=0)
+        inverse = attitude[flying].inv()
+        # Drag tilts the mean force of a flight whose mean velocity is not zero.
+        causes = np.insert(inverse.apply(velocity[flying]), 0, 1.0, axis=1)
+        x, y, z = np.linalg.lstsq(causes, inverse.apply(force[flying]), rcond=None)[0][0]
         attitude = attitude * Rotation.from_rotvec([-y / z, x / z, 0.0])
     quaternions = attitude.as_quat()[:, [3, 0, 1, 2]]
     # Of q and -q, which are the same attitude, the one nearer to the row before
@@ -330,7 +333,7 @@ def _in_the_air(log: Log, knows_height: bool) -> Log:
             f"{log.path}: motor M{motor + 1} gets {means[motor]:.3g} on average as {log.kind}, "
             f"where {low:g} to {high:g} is likely; check its unit"
         )
-    mean_force = log.force[flying].mean()
+    mean_force = log.force[flying, 2].mean()
     if not 0.6 * GRAVITY < mean_force < 1.6 * GRAVITY:
         raise ConfigError(
             f"{log.path}: the accelerometer shows {mean_force:.3g} m/s² along z in flight, "

@@ -70,8 +70,8 @@ class Windows:
 
         :param vehicle: with the control step and delay of the one that the windows were made for.
         :param thrusts: of all rows of all logs, in the vehicle's order, (n, 4), N.
-        :return: after each of ``ends`` the motion, (windows, 13), and the specific force along z,
-            m/s², as the last column.
+        :return: after each of ``ends`` the motion and the specific force, body axes, m/s²,
+            (windows, 13 + 3).
         """
         batch = self.batch
         batch.vehicles[:] = vehicle.parameters()[:, None]
@@ -87,8 +87,7 @@ class Windows:
             batch.step(actions[rows])
             rows += 1
             if now + 1 in self.ends:
-                force = batch.true_state().specific_force[:, 2:]
-                yield np.hstack([motion.T, force])
+                yield np.hstack([motion.T, batch.true_state().specific_force])
 
 
 def log_thrusts(
