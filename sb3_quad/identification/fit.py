@@ -30,8 +30,8 @@ HORIZONS_OF_RATES = np.arange(0.02, 0.11, 0.02), np.arange(0.02, 0.21, 0.02)
 LAGS = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.06, 0.08, 0.11, 0.15])
 DELAYS = np.arange(0.0, 0.035, 0.005)
 MOST_THRUST = 30.0  # of a motor at full command, by what it needs to hover
-# No interval is narrower than this part of its value, or this many seconds of a delay: simulated
-# logs with noise show such errors beyond the jackknife's intervals.
+# No interval is narrower than this part of its value or size, or this many seconds of a delay:
+# simulated logs with noise show such errors beyond the jackknife's intervals.
 LEAST_WIDTH = 0.03
 LEAST_DELAY_WIDTH = 0.0015
 
@@ -59,21 +59,20 @@ def fit_vehicle(
     :raises ConfigError: the logs contradict the start, or do not fly for long enough.
     """
     report = show or (lambda done, total, text: None)
-    report(0, 4, "regressions")
+    report(0, 3, "regressions")
     guess = first_guess(logs, start)
-    report(1, 4, "short horizons")
+    report(1, 3, "predictions")
     short, long = HORIZONS if logs[0].has_motion else HORIZONS_OF_RATES
     model = Model(logs, guess, short)
     free = model.free()
-    optimum = model.solve(model.vector_of(guess), free, 12)
-    report(2, 4, "all horizons")
+    optimum = model.solve(model.vector_of(guess), free, 10)
     # Sizes are those of the fit so far, since damping grows with the inertia.
     guess = model.guess(optimum.vector)
     model = Model(logs, guess, long)
     vector = model.vector_of(guess)
     model.weigh(vector)
-    optimum = model.solve(vector, free, 8)
-    report(3, 4, "what the logs tell")
+    optimum = model.solve(vector, free, 6)
+    report(2, 3, "what the logs tell")
     vector = optimum.vector
     before = guess._replace(vehicle=start)
     known = model.vector_of(before)
@@ -83,17 +82,17 @@ def fit_vehicle(
         table.loc[place, "reason"] = reason
     free = model.free()
     model.weigh(vector)
-    optimum = model.solve(vector, free, 8)
+    optimum = model.solve(vector, free, 4)
     known[free] = optimum.vector[free]
     table["start"] = before.vector()
     table["value"] = known * model.scale
     table["width"] = np.nan
     table.loc[free, "width"] = jackknife(optimum.slopes, optimum.errors) * model.scale[free]
     delay = len(guess.curve.coefficients)
-    least = LEAST_WIDTH * table["value"].abs()
+    least = LEAST_WIDTH * np.maximum(table["value"].abs(), table["size"])
     least[delay] = LEAST_DELAY_WIDTH
     table["width"] = table["width"].clip(least)
-    report(4, 4, "done")
+    report(3, 3, "done")
     with raised_as(ConfigError, f"{logs[0].path}: the fit is no vehicle that can fly"):
         fitted = before.moved(known * model.scale)
     steps = round(fitted.delay / start.control_step)

@@ -42,7 +42,7 @@ def read_logs(paths: Iterable[StrPath] | StrPath, step: float | None = None) -> 
     """
     files: list[Path] = []
     for path in [paths] if isinstance(paths, (str, Path)) else paths:
-        inside = sorted(Path(path).iterdir()) if Path(path).is_dir() else [Path(path)]
+        inside = sorted(Path(path).glob("*")) or [Path(path)]
         files += [file for file in inside if file.suffix not in (".yaml", ".yml", ".md")]
     recordings = [read_recording(file) for file in files if not file.is_dir()]
     if not recordings:

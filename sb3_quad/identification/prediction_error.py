@@ -141,7 +141,7 @@ class Model:
             loss="soft_l1",
             max_nfev=evaluations,
             xtol=1e-4,
-            ftol=1e-5,
+            ftol=3e-5,
         )
         fitted[free] = solution.x
         # SciPy has weighted the slopes, but not the errors.
