@@ -107,7 +107,7 @@ class Model:
         for part, size in zip(self.parts(vector), self.sizes, strict=True):
             scaled.append((part / size).reshape(len(part), -1))
         # Predictions that diverge must not become infinite.
-        return np.clip(np.hstack(scaled), -1e3, 1e3)
+        return np.asarray(np.clip(np.hstack(scaled), -1e3, 1e3))
 
     def weigh(self, vector: FloatArray) -> None:
         """Count errors by the size that they have now, each column after each horizon."""
