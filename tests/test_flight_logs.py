@@ -5,6 +5,7 @@ Logs that our own simulator wrote give back the parameters it flew with.
 
 import sys
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -16,11 +17,15 @@ from scipy.spatial.transform import Rotation
 from sb3_quad import GeometricExpert, QuadcopterVecEnv, load_vehicle
 from sb3_quad.base.errors import ConfigError, MissingExtra
 from sb3_quad.cli import main
-from sb3_quad.envs.simulation.state import QUATERNION
+from sb3_quad.envs.simulation.state import QUATERNION, VELOCITY
+from sb3_quad.envs.vehicles.vehicle import GRAVITY
 from sb3_quad.identification import fit_vehicle, read_logs
+from sb3_quad.identification.alignment import mounting
 from sb3_quad.identification.curve import Curve, refuse_other_order
-from sb3_quad.identification.flight_log import THRUST_BY_VOLTAGE, motor_thrusts
-from sb3_quad.identification.open_loop import open_loop
+from sb3_quad.identification.flight_log import attitudes, quaternions
+from sb3_quad.identification.open_loop import gaps, open_loop
+from sb3_quad.identification.readers import THRUST_BY_VOLTAGE, motor_thrusts
+from sb3_quad.identification.smoothing import smoothed
 
 CAPTURE_COLUMNS = ["px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz"]
 GYRO_COLUMNS = ["gyro_x", "gyro_y", "gyro_z"]
@@ -110,6 +115,29 @@ def test_a_quaternion_and_its_negative_are_one_attitude(tmp_path):
     found = read_back(table, tmp_path).motion[:, QUATERNION]
     cosines = (found * expected[:, QUATERNION]).sum(axis=1)
     np.testing.assert_allclose(cosines, cosines[0], atol=1e-9)
+
+
+def test_drag_at_a_mean_velocity_is_no_tilt_of_the_markers():
+    random = np.random.default_rng(0)
+    body = Rotation.from_rotvec(0.2 * random.standard_normal((500, 3)))
+    velocity = random.normal([1.0, 0.5, 0.0], 1.0, (500, 3))
+    drag = body.apply(0.3 * body.inv().apply(velocity))
+    force = body.apply([0.0, 0.0, GRAVITY]) - drag
+    tilt = Rotation.from_rotvec([0.02, -0.03, 0.0])
+    found = mounting(body * tilt.inv(), velocity, force)
+    np.testing.assert_allclose(found.as_rotvec(), tilt.as_rotvec(), atol=1e-3)
+
+
+def test_smoothing_takes_noise_away_and_keeps_fast_turns(tmp_path):
+    table = turning()
+    clean = read_back(table, tmp_path)
+    noise = 0.02 * np.random.default_rng(0).standard_normal((2, len(clean.motion), 3))
+    noisy = clean.motion.copy()
+    noisy[:, VELOCITY] += noise[0]
+    noisy[:, QUATERNION] = quaternions(attitudes(noisy) * Rotation.from_rotvec(noise[1]))
+    for motion, most in ((clean.motion, 0.002), (noisy, 0.008)):
+        position, velocity, turn, _ = gaps(smoothed(replace(clean, motion=motion)), clean.motion)
+        assert np.std([velocity, turn]) < most and np.std(position) < most
 
 
 def test_pwm_becomes_the_thrust_that_the_firmware_expects():
@@ -220,7 +248,7 @@ def test_each_format_is_read_in_the_same_units_and_axes(table, tmp_path, write, 
     assert (log.order, log.kind, log.has_motion, log.step) == (order, "share", False, 0.005)
     rows = slice(20, 1100)
     np.testing.assert_allclose(log.motion[rows, -3:], table[GYRO_COLUMNS][rows], atol=accuracy)
-    np.testing.assert_allclose(log.force[rows], table["acc_z"][rows], atol=accuracy)
+    np.testing.assert_allclose(log.force[rows, 2], table["acc_z"][rows], atol=accuracy)
     commands = table[[f"share_{k}" for k in (1, 2, 3, 4)]][rows]
     np.testing.assert_allclose(log.mean_commands()[rows], commands, atol=accuracy)
 

@@ -9,6 +9,6 @@ __getattr__, __dir__ = lazy_names(
         "Fit": "sb3_quad.identification.fit",
         "Log": "sb3_quad.identification.flight_log",
         "fit_vehicle": "sb3_quad.identification.fit",
-        "read_logs": "sb3_quad.identification.flight_log",
+        "read_logs": "sb3_quad.identification.logs",
     },
 )

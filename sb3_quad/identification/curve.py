@@ -68,7 +68,7 @@ def regress(
         # A row's command acts until the next one, where the force of that row is.
         rows = log.flying[1:]
         regressors.append(lagged(terms, gain, log.step)[:-1][rows] / vehicle.mass)
-        forces.append(log.force[1:][rows])
+        forces.append(log.force[1:, 2][rows])
     left = np.concatenate(regressors)
     right = np.concatenate(forces)
     # Hardly excited powers must not be taken for large numbers that cancel each other.

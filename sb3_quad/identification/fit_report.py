@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from textwrap import indent
 
 import numpy as np
 import yaml
@@ -15,7 +16,7 @@ from sb3_quad.evaluation.plots import HEIGHT, WIDTH, legend, styled
 from sb3_quad.evaluation.tables import COLOURS, Table
 from sb3_quad.identification.curve import Curve
 from sb3_quad.identification.fit import Fit
-from sb3_quad.identification.flight_log import MOTION_SIZE, Log
+from sb3_quad.identification.flight_log import Log
 from sb3_quad.identification.open_loop import Windows, log_thrusts
 
 # How far each prediction of the picture goes, and how long the picture is, s
@@ -46,12 +47,16 @@ def write_vehicle(path: StrPath, fit: Fit, logs: Sequence[Log]) -> None:
     """
     seconds = sum(log.step * log.flying.sum() for log in logs)
     names = ", ".join(dict.fromkeys(log.path.name for log in logs))
-    lines = [f"# Fitted by sb3-quad fit to {seconds:.0f} s of {names}."]
-    lines += [f"# {line}" for line in estimate_table(fit).markdown().splitlines()]
-    content = fit.vehicle.model_dump(mode="json", exclude_defaults=True)
-    short = json.loads(json.dumps(content), parse_float=lambda text: float(f"{float(text):.6g}"))
+    table = estimate_table(fit).markdown()
+    comments = f"Fitted by sb3-quad fit to {seconds:.0f} s of {names}.\n{table}\n"
+    content = json.dumps(fit.vehicle.model_dump(mode="json", exclude_defaults=True))
+    short = json.loads(content, parse_float=_short)
     text = yaml.safe_dump(short, sort_keys=False, default_flow_style=None)
-    write_text(path, "\n".join([*lines, text]))
+    write_text(path, indent(comments, "# ") + text)
+
+
+def _short(number: str) -> float:
+    return float(f"{float(number):.6g}")
 
 
 @styled
@@ -61,25 +66,23 @@ def prediction_plot(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> Figu
 
     :param logs: with rows at the vehicle's control step.
     """
-    step = vehicle.control_step
     log = logs[0]
+    step = vehicle.control_step
     count = round(AHEAD / step)
     windows = Windows([log], vehicle, range(1, count + 1), count)
-    flights = windows.fly(vehicle, log_thrusts([log], vehicle, curve))
-    # A row without numbers parts each prediction from the next.
-    pieces = [windows.start, *flights, np.full_like(windows.start, np.nan)]
-    predicted = np.concatenate([piece[:, None, :MOTION_SIZE] for piece in pieces], axis=1)
-    rows = np.arange(len(log.motion))[windows.rows[0] :][: round(SHOWN / step)]
-    shown = windows.rows < rows[-1]
-    times = step * (windows.rows[shown, None] + np.arange(count + 2))
+    flown = windows.fly(vehicle, log_thrusts([log], vehicle, curve))
+    predicted = np.stack([windows.start, *(motion for motion, _ in flown)])
+    first = windows.rows[0]
+    shown = windows.rows < first + round(SHOWN / step)
+    rows = windows.rows[shown] + np.arange(count + 1)[:, None]
+    recorded = np.arange(first, rows.max())
     panels = PANELS if log.has_motion else PANELS[:1]
     figure = Figure(figsize=(3 * WIDTH, HEIGHT * len(panels)), layout="constrained")
     all_axes = figure.subplots(len(panels), 3, squeeze=False, sharex=True)
     for line, (name, unit, part) in zip(all_axes, panels, strict=True):
         for k, axes in enumerate(line, part.start):
-            axes.plot(step * rows, log.motion[rows, k], "k", label="measured")
-            flat = predicted[shown, :, k].ravel()
-            axes.plot(times.ravel(), flat, color=COLOURS[1], label="predicted")
+            axes.plot(step * recorded, log.motion[recorded, k], "k", label="measured")
+            axes.plot(step * rows, predicted[:, shown, k], color=COLOURS[1], label="predicted")
             axes.set(ylabel=f"{name} {'xyz'[k - part.start]} ({unit})", xlabel="time (s)")
     legend(figure)
     return figure

@@ -18,12 +18,12 @@ from sb3_quad.envs.simulation.state import (
 )
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.evaluation.tables import Table
-from sb3_quad.identification.curve import Curve, fit_curve
+from sb3_quad.identification.curve import Curve, fit_curve, lagged
 from sb3_quad.identification.flight_log import MOTION_SIZE, Log, attitudes, rotor_columns
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
 # Time before a window whose commands spin up the rotors, s
-WARM_UP = 0.5
+WARM_UP = 0.25
 QUANTITIES = ("position, m", "velocity, m/s", "attitude, °", "body rates, rad/s")
 
 
@@ -33,7 +33,6 @@ class Windows:
     :param logs: with rows at the vehicle's control step.
     :param ends: control steps from the begin of a window to where it is compared, rising.
     :param stride: rows from one window to the next.
-    :param warm_up: time before each window whose commands spin up the rotors, s.
     :raises ConfigError: no log flies for long enough.
     """
 
@@ -43,15 +42,14 @@ class Windows:
         vehicle: Vehicle,
         ends: Sequence[int],
         stride: int = 1,
-        warm_up: float = WARM_UP,
     ) -> None:
         self.ends = ends
-        self.before = round(warm_up / vehicle.control_step)
-        length = self.before + ends[-1] + 1
+        before = round(WARM_UP / vehicle.control_step) + vehicle.delay
+        length = before + ends[-1] + 1
         # A window is valid only if all of its rows fly, and are of one log.
         flying = np.concatenate([np.append(log.flying[:-1], False) for log in logs])
         whole = np.convolve(flying, np.ones(length), "valid") > length - 0.5
-        self.rows = self.before + np.flatnonzero(whole)[::stride]
+        self.rows = before + np.flatnonzero(whole)[::stride]
         if self.rows.size == 0:
             seconds = length * vehicle.control_step
             raise ConfigError(f"no log flies for {seconds:.3g} s without a gap")
@@ -65,30 +63,30 @@ class Windows:
         settings = FlightSettings(vehicle=in_air, noise=0.0)
         self.batch = QuadcopterBatch(self.rows.size, settings, seed=0, autoreset=False)
 
-    def fly(self, vehicle: Vehicle, thrusts: FloatArray) -> Iterator[FloatArray]:
+    def fly(self, vehicle: Vehicle, thrusts: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Fly all windows.
 
         :param vehicle: with the control step and delay of the one that the windows were made for.
         :param thrusts: of all rows of all logs, in the vehicle's order, (n, 4), N.
-        :return: after each of ``ends`` the motion, (windows, 13), and the specific force along z,
-            m/s², as the last column.
+        :return: after each of ``ends`` the motion, (windows, 13), and the specific force, body
+            axes, m/s², (windows, 3).
         """
         batch = self.batch
         batch.vehicles[:] = vehicle.parameters()[:, None]
         batch.reset()
         actions = vehicle.thrust_to_action(thrusts)
-        rows = self.rows - self.before
-        held = np.clip(thrusts[rows], *vehicle.thrust_range)
-        batch.state[ROTOR_SPEEDS] = np.sqrt(held / vehicle.lift).T
-        motion = batch.state[:MOTION_SIZE]
-        for now in range(-self.before, self.ends[-1]):
+        held = np.sqrt(np.clip(thrusts, *vehicle.thrust_range) / vehicle.lift)
+        gain = 0.5 * (vehicle.motor_gain_up + vehicle.motor_gain_down)
+        speeds = lagged(held, gain, vehicle.control_step)
+        # Commands that still wait are given first.
+        for now in range(-vehicle.delay, self.ends[-1]):
             if now == 0:
-                motion[:] = self.start.T
-            batch.step(actions[rows])
-            rows += 1
+                batch.state[:MOTION_SIZE] = self.start.T
+                batch.state[ROTOR_SPEEDS] = speeds[self.rows - vehicle.delay - 1].T
+            batch.step(actions[self.rows + now])
             if now + 1 in self.ends:
-                force = batch.true_state().specific_force[:, 2:]
-                yield np.hstack([motion.T, force])
+                state = batch.true_state()
+                yield state.array[:MOTION_SIZE].T.copy(), state.specific_force
 
 
 def log_thrusts(
@@ -116,7 +114,7 @@ def gaps(motion: FloatArray, record: FloatArray) -> list[FloatArray]:
     units of ``QUANTITIES`` but rad: attitudes as rotation vectors in recorded body axes.
     """
     turned = (attitudes(record).inv() * attitudes(motion)).as_rotvec()
-    gap = motion[:, :MOTION_SIZE] - record
+    gap = motion - record
     return [gap[:, POSITION], gap[:, VELOCITY], turned, gap[:, BODY_RATES]]
 
 
@@ -141,7 +139,7 @@ def open_loop(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> FloatArray
     # They are calibrated already.
     vehicle = vehicle.model_copy(update={"thrust_factors": [1.0] * 4})
     errors = []
-    for end, flown in zip(ends, windows.fly(vehicle, thrusts), strict=True):
+    for end, (flown, _) in zip(ends, windows.fly(vehicle, thrusts), strict=True):
         time = end * vehicle.control_step
         stays[:, POSITION] = start[:, POSITION] + start[:, VELOCITY] * time
         rotation = attitudes(start) * Rotation.from_rotvec(start[:, BODY_RATES] * time)
@@ -158,16 +156,18 @@ def error_table(logs: Sequence[Log], vehicles: Mapping[str, tuple[Vehicle, Curve
     :param vehicles: by the heading of their column, with the thrust of a motor over its command, or
         None: fitted to these logs.
     """
-    columns = []
+    errors = []
     for vehicle, curve in vehicles.values():
-        errors = open_loop(logs, vehicle, curve or fit_curve(logs, vehicle))
-        columns.append(errors[:, 0])
-    columns.append(errors[:, 1])
+        both = open_loop(logs, vehicle, curve or fit_curve(logs, vehicle))
+        errors.append(both[:, 0])
+    errors.append(both[:, 1])
+    columns = np.stack(errors, axis=-1)
     rows = []
     # Without motion, body rates are all that is known.
     known = 0 if logs[0].has_motion else len(QUANTITIES) - 1
     for number, quantity in enumerate(QUANTITIES[known:], known):
-        for horizon, values in zip(HORIZONS, np.array(columns)[:, :, number].T, strict=True):
-            rows.append([f"{quantity}, after {horizon:g} s", *(f"{one:.3g}" for one in values)])
+        for horizon, values in zip(HORIZONS, columns[:, number], strict=True):
+            cells = [f"{value:.3g}" for value in values]
+            rows.append([f"{quantity}, after {horizon:g} s", *cells])
     heads = ("root mean square of the error", *vehicles, "velocity, rates stay")
     return Table(heads, rows, f"{len(logs)} logs, open loop")

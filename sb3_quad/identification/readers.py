@@ -21,6 +21,7 @@ from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray, StrDict, StrPath
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.envs.simulation.motions import read_table
+from sb3_quad.identification.series import interpolated
 
 LARGEST_LOG = 300_000_000  # bytes
 LONGEST_NAME = 100  # bytes
@@ -34,6 +35,11 @@ WAY_OUT = (
     "a log has motor commands, gyro, and an accelerometer or attitude and velocity; "
     "docs/your_vehicle.md lists the columns of each format"
 )
+
+# Thrust of a motor, N, as coefficients of the powers of its voltage, from the 0th:
+# crazyflie-firmware 2025.12, platform_defaults_cf2.h, CONFIG_CRAZYFLIE_21_PLUS. The voltage is PWM
+# / 65,535 of the battery's.
+THRUST_BY_VOLTAGE = (-0.0247653792, 0.0652379353, -0.0267925050, 0.0067767893)
 
 Part = Mapping[str, Any]
 """Columns that were recorded at the same times, (n,) each, by name."""
@@ -183,3 +189,17 @@ def _csv(path: Path, data: bytes) -> tuple[Part, StrDict]:
     table = read_table(path, LARGEST_LOG, skipped)
     # Betaflight's blackbox_decode adds the unit of the time.
     return dict(table.rename(columns=lambda name: name.removesuffix(" (us)"))), headers
+
+
+def motor_thrusts(share: FloatArray, battery: FloatArray) -> FloatArray:
+    """Return the thrusts that the Crazyflie's firmware expects from its commands, (n, 5), N.
+
+    Rows in which a motor rests, or gets more than it can, are skipped.
+
+    :param share: times, s, and commands of the motors, 0 to 1, (n, 5).
+    :param battery: times, s, and V, (samples, 2).
+    """
+    commands = share[:, 1:]
+    valid = share[((commands > 0.0) & (commands <= 1.0)).all(axis=1)]
+    voltage = valid[:, 1:] * interpolated(battery, valid[:, 0])
+    return np.insert(np.polynomial.Polynomial(THRUST_BY_VOLTAGE)(voltage), 0, valid[:, 0], axis=1)

@@ -86,7 +86,7 @@ def run(options: Namespace) -> int:
         if own.vehicles is not None and (notice := unlike_trained(name, own, vehicle)):
             print("unusual:", notice)
     if options.flights is not None:
-        from sb3_quad.identification.flight_log import read_logs
+        from sb3_quad.identification.logs import read_logs
         from sb3_quad.identification.open_loop import error_table
 
         logs = read_logs(options.flights, vehicle.control_step)

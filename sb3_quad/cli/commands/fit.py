@@ -50,7 +50,7 @@ def run(options: Namespace) -> int:
         split,
         write_vehicle,
     )
-    from sb3_quad.identification.flight_log import read_logs
+    from sb3_quad.identification.logs import read_logs
     from sb3_quad.identification.open_loop import error_table
 
     output = Path(options.output)
