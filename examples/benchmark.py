@@ -87,7 +87,7 @@ def main() -> None:
     subjects = {}
     for rows in options.sizes:
         subjects[f"batch, {rows} rows"] = partial(flying, rows)
-    subjects["gradient"] = differentiating
+    subjects["gradient"] = partial(differentiating)
     for algorithm in (DAgger, PPOBC, APG):
         subjects[f"{algorithm.__name__}, whole loop"] = partial(training, algorithm)
     for name, make in subjects.items():

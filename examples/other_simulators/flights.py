@@ -506,13 +506,13 @@ def main(
     """
     options = parse_options(description, [*cells], [*others], curves)
     header = HEADER
-    names = options.cells or [*cells]
+    names = [*cells]
     if options.curves:
         columns = ["vehicle", "conditions", "controller", *options.curves]
         header = f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|"
-        names = options.cells or [name for name in cells if "," not in cells[name].conditions]
+        names = [name for name in cells if "," not in cells[name].conditions]
     print(header)
-    for cell in (cells[name] for name in names):
+    for cell in (cells[name] for name in options.cells or names):
         check_rotors(cell.make)
         simulator = cell.make(options.n)
         policies: dict[str, Policy] = {}
