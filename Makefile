@@ -21,7 +21,7 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-all test-portable campaign coverage fuzz test-zoo test-transfer transfer-table transfer-files docs notebooks docs-links pictures lint format type type-demo links release-check commit-checks clean
+.PHONY: help install train test test-all test-portable campaign coverage fuzz test-zoo test-transfer transfer-table transfer-files compare-projects docs notebooks docs-links pictures lint format type type-demo links release-check commit-checks clean
 
 help:
 	@echo "make install        make $(VENV)/ with the package and its tools; then: . $(VENV)/bin/activate && sb3-quad --help"
@@ -35,6 +35,7 @@ help:
 	@echo "make test-zoo       run the tests that need rl_zoo3, Ray or wandb, in an environment of its own"
 	@echo "make test-transfer  fly exported agents in the simulators of others, in an environment of its own"
 	@echo "make transfer-table print the table of docs/research/export.md, ARGS=\"-n 64 --curves\""
+	@echo "make compare-projects  measure them and this package on one core, ARGS=\"--only batch\" some rows"
 	@echo "make docs           build the site into build/docs/, in an environment of its own; what is missing or broken is an error"
 	@echo "make pictures       draw the pages' pictures anew, ARGS=\"starts.png\" some of them; docs/pictures.py has their commands"
 	@echo "make notebooks      run the notebooks whose code has changed, and keep their outputs for the site; ARGS=--rerun all"
@@ -104,6 +105,9 @@ transfer-table: $(TRANSFER_INSTALLED) transfer-files
 	done; echo; echo "In sb3_quad:"; echo; \
 	PYTHONPATH=$(CURDIR):$$($(abspath $(PY)) -c 'import sysconfig; print(sysconfig.get_path("purelib"))') \
 	$(TRANSFER_PY) $(abspath $(OTHERS))/in_own.py *.onnx --delay 0 1 $(ARGS)
+
+compare-projects: $(INSTALLED) $(TRANSFER_INSTALLED)
+	OMP_NUM_THREADS=1 PYTHONPATH=$(OTHERS) $(PY) -W ignore examples/compare_projects.py --others $(TRANSFER_VENV)/bin/python $(ARGS)
 
 # A crazyflie-robust flies the crazyflies only, itm-robust itm.
 transfer-files: $(INSTALLED)

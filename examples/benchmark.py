@@ -30,9 +30,12 @@ REFERENCE_RATE = 9.15e6
 RECORDED = 32  # control steps
 TRAINED_ROWS = 256
 
+# How many control steps a call flies, and the call
+Subject = tuple[int, Callable[[], Any]]
 
-def flying(rows: int) -> tuple[int, Callable[[], Any]]:
-    """Return the number of control steps of a call, and the call: a step of the batch."""
+
+def flying(rows: int) -> Subject:
+    """A step of the batch."""
     env = QuadcopterVecEnv(rows, TASK, seed=0)
     env.reset()
     random = np.random.default_rng(0)
@@ -40,8 +43,8 @@ def flying(rows: int) -> tuple[int, Callable[[], Any]]:
     return rows, lambda: env.step(next(actions))
 
 
-def differentiating() -> tuple[int, Callable[[], Any]]:
-    """Likewise: recorded flights of random actions, and the gradient of a cost of them."""
+def differentiating() -> Subject:
+    """Recorded flights of random actions, and the gradient of a cost of them."""
     env = QuadcopterVecEnv(TRAINED_ROWS, TASK, seed=0)
     tape = env.record(RECORDED)
     random = np.random.default_rng(0)
@@ -64,8 +67,8 @@ def differentiating() -> tuple[int, Callable[[], Any]]:
     return RECORDED * TRAINED_ROWS, call
 
 
-def training(algorithm: type) -> tuple[int, Callable[[], Any]]:
-    """Likewise: one iteration of a training with the algorithm's own defaults."""
+def training(algorithm: type) -> Subject:
+    """One iteration of a training with the algorithm's own defaults."""
     env = QuadcopterVecEnv(TRAINED_ROWS, TASK, seed=0)
     expert = {} if algorithm is APG else {"expert": "pid"}
     model = algorithm("MlpPolicy", env, seed=0, device="cpu", **expert)

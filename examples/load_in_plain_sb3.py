@@ -114,9 +114,8 @@ class Quadcopter:
             self.position += dt * self.velocity
 
             # Turn by the exponential of the rotation vector dt ω (Rodrigues' formula).
-            x, y, z = dt * self.body_rates
-            turn = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-            angle = np.sqrt(x * x + y * y + z * z)
+            turn = np.cross(np.eye(3), dt * self.body_rates)
+            angle = dt * np.linalg.norm(self.body_rates)
             half = np.sinc(angle / 2 / np.pi) ** 2 / 2
             self.rotation = self.rotation @ (
                 np.eye(3) + np.sinc(angle / np.pi) * turn + half * turn @ turn

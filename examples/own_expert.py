@@ -13,7 +13,6 @@ On the command line the same class teaches as `PYTHONPATH=examples sb3-quad trai
 import argparse
 
 import numpy as np
-from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import DAgger, GeometricExpert, PIDExpert, QuadcopterVecEnv, fly
 from sb3_quad.experts.protocol import Expert
@@ -51,23 +50,7 @@ if __name__ == "__main__":
 
     expert = SwitchingExpert()
     env = QuadcopterVecEnv(240, task="state_recovery", max_episode_steps=500, seed=0)
-    model = DAgger(
-        "MlpPolicy",
-        env,
-        expert=expert,
-        n_steps=125,
-        batch_size=2048,
-        gradient_steps=100,
-        n_epochs=1,
-        gamma=0.99,
-        learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
-        beta=1.0,  # the expert flies the first rollout, and less of each following one
-        beta_decay=0.2,
-        beta_final=0.0,
-        dataset_capacity=1_500_000,
-        seed=0,
-        device="cpu",
-    )
+    model = DAgger("MlpPolicy", env, expert=expert, seed=0)
     model.learn(arguments.timesteps)
     for name, controller in (("PID", PIDExpert()), ("own expert", expert), ("agent", model)):
         flights = fly(controller, "state_recovery", n_episodes=480, seed=1_000_000)

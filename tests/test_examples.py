@@ -18,11 +18,8 @@ SHORT = ("--timesteps", "100")  # a single rollout
 # Scripts with what makes them short, and a part of what they print. Others have tests below, or in
 # test_zoo.py, test_crazyflie_app.py, test_pretrained.py and test_zip_portability.py.
 SCRIPTS = {
-    "two_stages.py": (("--timesteps", "100", "100"), "agent, target_tracking: success"),
     "own_expert.py": (SHORT, "agent: success"),
-    "own_vehicle.py": (SHORT, "agent: success"),
     "own_reward.py": (SHORT, "agent after training: mean reward"),
-    "own_callback.py": (("--timesteps", "100000"), "crashed"),
 }
 
 
@@ -58,7 +55,7 @@ WEEKLY = [pytest.mark.slow, pytest.mark.campaign]
     "name",
     [
         pytest.param("own_reward", marks=pytest.mark.slow),
-        *(pytest.param(f"own_{name}", marks=WEEKLY) for name in ("expert", "vehicle", "callback")),
+        pytest.param("own_expert", marks=WEEKLY),
     ],
 )
 def test_an_agent_succeeds_as_it_is_shipped(run, name):

@@ -51,13 +51,10 @@ class State:
     @property
     def rotation(self) -> Array:
         """Rotation matrices, body to world, (n, 3, 3)."""
-        w, x, y, z = self.quaternion.T
-        rows = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-        return np.moveaxis(np.array(rows), -1, 0)
+        vector = self.quaternion[:, 1:]
+        # Cross products with the vector
+        skew = np.cross(np.eye(3), vector[:, None])
+        return np.eye(3) + 2.0 * (self.quaternion[:, :1, None] * skew + skew @ skew)
 
 
 @dataclass
@@ -317,17 +314,6 @@ def fly(
     return Flights(~lost, succeeded, errors[-1], first * CONTROL_STEP, last * CONTROL_STEP)
 
 
-@dataclass
-class Following:
-    """How n flights followed a curve, (n,) each: root mean square and greatest distance, m.
-
-    They count from 2 s on, and are infinite for a flight that crashed or got out of range.
-    """
-
-    rms: Array
-    greatest: Array
-
-
 def follow(
     simulator: Simulator,
     policy: Policy,
@@ -336,8 +322,11 @@ def follow(
     noise: float,
     delay: int,
     moving: bool = False,
-) -> Following:
+) -> Array:
     """Follow a curve from a hover at its start; parameters are as for ``fly``.
+
+    Returns root mean square and greatest distance, m, of each flight, (2, n). They count from 2 s
+    on, and are infinite for a flight that crashed or got out of range.
 
     :param moving: begin with the curve's velocity instead, level.
     """
@@ -347,7 +336,7 @@ def follow(
         start.velocity = np.tile(motion[0, 1], (simulator.n, 1))
     errors, _ = _errors(simulator, policy, start, start.position, motion, seed, noise, delay)
     settled = errors[SETTLED:]
-    return Following(np.sqrt(np.mean(settled**2, axis=0)), settled.max(axis=0))
+    return np.array([np.sqrt(np.mean(settled**2, axis=0)), settled.max(axis=0)])
 
 
 def _errors(
@@ -414,12 +403,13 @@ def table_row(labels: Iterable[str], targets: Flights, recoveries: Flights) -> s
     return f"| {' | '.join(cells)} |"
 
 
-def curve_cell(flights: Following) -> str:
+def curve_cell(flights: Array) -> str:
     """Format a cell: means over the flights that survived, and how many did if not all."""
-    survived = np.isfinite(flights.rms)
+    survived = np.isfinite(flights[0])
     if not survived.any():
         return "0 % survive"
-    cell = f"{flights.rms[survived].mean():.3f} / {flights.greatest[survived].mean():.3f} m"
+    rms, greatest = flights[:, survived].mean(axis=1)
+    cell = f"{rms:.3f} / {greatest:.3f} m"
     if not survived.all():
         cell += f" ({_percent(survived)} % survive)"
     return cell
@@ -516,13 +506,13 @@ def main(
     """
     options = parse_options(description, [*cells], [*others], curves)
     header = HEADER
-    names = options.cells or [*cells]
+    names = [*cells]
     if options.curves:
         columns = ["vehicle", "conditions", "controller", *options.curves]
         header = f"| {' | '.join(columns)} |\n{'|---' * len(columns)}|"
-        names = options.cells or [name for name in cells if "," not in cells[name].conditions]
+        names = [name for name in cells if "," not in cells[name].conditions]
     print(header)
-    for cell in (cells[name] for name in names):
+    for cell in (cells[name] for name in options.cells or names):
         check_rotors(cell.make)
         simulator = cell.make(options.n)
         policies: dict[str, Policy] = {}

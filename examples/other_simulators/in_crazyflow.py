@@ -49,12 +49,14 @@ class Crazyflow:
         roll, pitch, yaw = np.asarray(parameters["mixing_matrix"])
         arm = float(np.ravel(parameters["L"])[0])
         self.rotors = np.stack([-pitch * arm, roll * arm, yaw], axis=1)
-        kind = {
-            "dynamics": Dynamics.first_principles,
-            "control": control,
-            "integrator": Integrator.rk4,
-        }
-        self._sim = Sim(n_worlds=n, drone=drone, freq=FREQUENCY, **kind)
+        self._sim = Sim(
+            n_worlds=n,
+            drone=drone,
+            freq=FREQUENCY,
+            dynamics=Dynamics.first_principles,
+            control=control,
+            integrator=Integrator.rk4,
+        )
 
     def reset(self, start: State) -> None:
         self._sim.reset()

@@ -61,16 +61,13 @@ class Own:
         return np.asarray(self._vehicle.lift * (low + (high - low) * speeds) ** 2)
 
 
-CELLS = {
-    "cf2x_L250": Cell("cf2x_L250", "drag", partial(Own, "cf2x_L250", 0.0)),
-    "cf21B_500": Cell("cf21B_500", "drag", partial(Own, "cf21B_500", 0.0)),
-    "l2f_crazyflie": Cell("l2f_crazyflie", "no drag", partial(Own, "l2f_crazyflie", 0.0)),
-}
-for name in ("itm", "crazyflie", "hummingbird"):
-    CELLS[name] = Cell(name, "no drag", partial(Own, name, 0.0))
-for name in ("rotorpy_crazyflie", "rotorpy_hummingbird"):
-    CELLS[name] = Cell(name, "drag", partial(Own, name, 0.0))
-    CELLS[name + "_wind"] = Cell(name, "drag, wind 4 m/s", partial(Own, name, 4.0))
+CELLS = {}
+SMOOTH = ("l2f_crazyflie", "itm", "crazyflie", "hummingbird")
+for name in ("cf2x_L250", "cf21B_500", *SMOOTH, "rotorpy_crazyflie", "rotorpy_hummingbird"):
+    conditions = "no drag" if name in SMOOTH else "drag"
+    CELLS[name] = Cell(name, conditions, partial(Own, name, 0.0))
+    if name.startswith("rotorpy"):
+        CELLS[name + "_wind"] = Cell(name, "drag, wind 4 m/s", partial(Own, name, 4.0))
 
 
 def se3(simulator: Own) -> Policy | None:
