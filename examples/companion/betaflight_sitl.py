@@ -6,8 +6,9 @@ exported agent or the geometric expert commands it through RC channels. The same
     python examples/companion/betaflight_sitl.py --runs 50
     python examples/companion/betaflight_sitl.py --policy agent.onnx --runs 50
 
-Betaflight flies with its default PID gains and filters. Its clock waits for the simulation
-(lockstep.c), so a busy computer changes nothing. The ports are fixed: one SITL per computer.
+Betaflight flies with its default filters and gains, but for its integrals. Its clock waits for
+the simulation (lockstep.c), so a busy computer changes nothing. The ports are fixed: one SITL per
+computer.
 """
 
 import argparse
@@ -41,7 +42,9 @@ HEIGHT = 20.0  # m, of the target
 HEADER = """\
 | flight | loop | ends within 0.1 m | last second rms, m | at most | there after, s | sinks, m |
 |---|---|---|---|---|---|---|"""
-# 670 °/s at full stick, linear; no filter for sticks, since the policy's steps are wanted
+# 670 °/s at full stick, linear; no filter for sticks, since the policy's steps are wanted. Its
+# integrals wind up in a recovery, and the agent has one of its own. The simulated thrust is that of
+# the motors' speed squared.
 SETTINGS = """
 set small_angle = 180
 set runaway_takeoff_prevention = OFF
@@ -53,6 +56,10 @@ set roll_srate = 67
 set pitch_srate = 67
 set yaw_srate = 67
 set rc_smoothing = OFF
+set i_roll = 0
+set i_pitch = 0
+set i_yaw = 20
+set thrust_linear = 150
 feature -GPS
 aux 0 0 0 1700 2100 0 0
 save

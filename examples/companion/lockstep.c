@@ -110,3 +110,13 @@ int select(int n, fd_set *in, fd_set *out, fd_set *except, struct timeval *timeo
     int (*next)(int, fd_set *, fd_set *, fd_set *, struct timeval *) = dlsym(RTLD_NEXT, "select");
     return next(n, in, out, except, timeout);
 }
+
+/* The firmware's thread for TCP forgets what the main thread has opened before it began. */
+int pthread_create(pthread_t *thread, const pthread_attr_t *with, void *(*run)(void *), void *of)
+{
+    int (*next)(pthread_t *, const pthread_attr_t *, void *(*)(void *), void *);
+    next = dlsym(RTLD_NEXT, "pthread_create");
+    int result = next(thread, with, run, of);
+    usleep(200000);
+    return result;
+}
