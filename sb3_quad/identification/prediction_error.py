@@ -47,7 +47,7 @@ class Model:
         self.logs = logs
         self.start = start
         self.table = parameters_of(logs, start)
-        self.scale = self.table["size"].to_numpy()
+        self.scale: FloatArray = self.table["size"].to_numpy()
         self.has_motion = logs[0].has_motion
         step = logs[0].step
         ends = sorted({max(round(horizon / step), 1) for horizon in horizons})
