@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_quad.evaluation.offset_correction
@@ -76,6 +77,13 @@ def short_trainings(monkeypatch):
         return learn(self, min(total_timesteps, self.n_steps * self.n_envs), *args[:4], **kwargs)
 
     monkeypatch.setattr(OnPolicyAlgorithm, "learn", short)
+    off_policy = OffPolicyAlgorithm.learn
+
+    def short_off_policy(self, total_timesteps, **kwargs):
+        # One update follows the first steps after those of chance.
+        return off_policy(self, self.learning_starts + self.n_envs, **kwargs)
+
+    monkeypatch.setattr(OffPolicyAlgorithm, "learn", short_off_policy)
     monkeypatch.setattr(FlightSettings, "longest_episode", 100)
     # It needs an agent that flies.
     monkeypatch.setattr(

@@ -224,7 +224,7 @@ def test_a_scenario_moves_its_own_target():
         "target: [5, 0, 15], reference: {curve: circle, speed: 3}, duration: 3, n_episodes: 2"
     )
     recorder = Recorder(2)
-    flights = fly_scenario(GeometricExpert(), flown, "batch", [recorder])
+    flights = fly_scenario(GeometricExpert(), flown, [recorder])
     arrays = recorder.arrays()
     table = flown.reference.tracks(DT).table
     moved = (5.0, 0.0, 15.0) + table[:301:2, :3]
