@@ -106,24 +106,13 @@ def reinforce(watch):
     from stable_baselines3 import PPO
 
     from sb3_quad import QuadcopterVecEnv
+    from sb3_quad.training.config import load_config
 
-    tasks = {"state_recovery": 0.8, "target_tracking": 0.2}
-    env = QuadcopterVecEnv(480, task=tasks, max_episode_steps=500, seed=0)
-    agent = PPO(
-        "MlpPolicy",
-        env,
-        learning_rate=5e-4,
-        n_steps=125,
-        batch_size=3750,
-        n_epochs=6,
-        gamma=0.995,
-        gae_lambda=0.98,
-        ent_coef=1e-4,
-        policy_kwargs={"log_std_init": -0.916},
-        seed=0,
-        device="cpu",
-    )
-    agent.learn(15_000_000, watch)
+    recipe = load_config("ppo", "QuadStateRecovery-v0")
+    env = QuadcopterVecEnv(recipe.n_envs, seed=0, **recipe.env_kwargs)
+    settings = {"policy_kwargs": recipe.policy_kwargs, **recipe.hyperparams}
+    agent = PPO(recipe.policy, env, **settings, seed=0, device="cpu")
+    agent.learn(recipe.n_timesteps, watch)
 
 
 def train(learn):
@@ -144,9 +133,12 @@ def train(learn):
         def _on_rollout_end(self):
             self.rollouts += 1
             if self.rollouts % EVERY == 0:
-                self._on_training_end()
+                self.evaluate()
 
         def _on_training_end(self):
+            self.evaluate()
+
+        def evaluate(self):
             spent = process_time() - self.began
             share = float(fly(self.model, "state_recovery", 960, seed=5).success.mean())
             self.best = max(self.best, share)
