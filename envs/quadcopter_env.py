@@ -14,14 +14,12 @@ from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, Image, StrDi
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
-from sb3_quad.envs.rendering.window import Window, has_display
+from sb3_quad.envs.rendering.window import FPS, Window, has_display
 from sb3_quad.envs.simulation.checks import check_size
 from sb3_quad.envs.simulation.settings import ENDLESS, AsList
 from sb3_quad.envs.simulation.state import POSITION, P
 from sb3_quad.envs.simulation.tasks import TaskSpec
 
-# Pictures that a window shows in a second of flight
-WINDOW_FPS = 25.0
 Vector = Annotated[tuple[float, float, float], AsList]
 Quaternion = Annotated[tuple[float, float, float, float], AsList]
 
@@ -375,10 +373,10 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         """Draw into the window, if there is one and its next picture is due."""
         if self._window is None or not self._window.is_open:
             return
-        self._frames_due += WINDOW_FPS * self.vehicle.control_step
+        self._frames_due += FPS * self.vehicle.control_step
         if self._frames_due >= 1.0:
             self._frames_due %= 1.0
-            self._window.show(self._draw(), 1.0 / WINDOW_FPS)
+            self._window.show(self._draw(), 1.0 / FPS)
 
     def close(self) -> None:
         """End the simulation; calling it twice is fine."""

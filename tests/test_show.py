@@ -21,11 +21,12 @@ from sb3_quad.cli import main
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.envs.rendering.picture import Trail, draw
+from sb3_quad.envs.rendering.window import FPS
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.show.episodes import fixed_setting, fly_all, scenario_setting
-from sb3_quad.show.film import FPS, HOLD, film_frames, following_camera, frame_times, write_film
+from sb3_quad.show.film import HOLD, film_frames, following_camera, frame_times, write_film
 from sb3_quad.training.config import load_config
 from sb3_quad.training.runs import claim_run
 

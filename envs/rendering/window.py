@@ -10,6 +10,7 @@ from sb3_quad.base.errors import ConfigError, raised_as
 from sb3_quad.base.types import Image
 
 DPI = 100
+FPS = 25  # pictures a second, of windows and films
 
 
 def has_display() -> bool:
@@ -30,7 +31,8 @@ class Window:
             from matplotlib import pyplot
 
             size = (width / DPI, height / DPI)
-            self.figure = pyplot.figure(figsize=size, dpi=DPI, facecolor="black")
+            with pyplot.rc_context({"toolbar": "None"}):
+                self.figure = pyplot.figure(figsize=size, dpi=DPI, facecolor="black")
             if self.figure.canvas.required_interactive_framework is None:
                 pyplot.close(self.figure)
                 raise ConfigError(

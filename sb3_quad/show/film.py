@@ -14,12 +14,11 @@ from sb3_quad.base.imports import require
 from sb3_quad.base.types import FloatArray, Image, StrDict
 from sb3_quad.envs.rendering.camera import MARGIN, Camera, Lens, framing_camera
 from sb3_quad.envs.rendering.picture import draw, relative_size
-from sb3_quad.envs.rendering.window import Window
+from sb3_quad.envs.rendering.window import FPS, Window
 from sb3_quad.envs.simulation.state import POSITION, TARGET
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.show.episodes import Episode, Recording, outlook
 
-FPS = 25
 HOLD = 0.4  # the last picture stays for this long, s
 AHEAD = 3.0  # how much of the way to its target a camera shows, m, for the default vehicle
 TEXT_SHARE = 1 / 24  # size of the text, in heights of the picture
