@@ -43,11 +43,12 @@ sb3-quad enjoy "RL agent=itm-recovery" geometric "PID expert=pid"
     --task state_recovery --seed 13 -n 90 --speed 0.5 --size 320x320 -o film.webp
 frame film.webp 32 film_frame.png
 """,
-    "side_hit_size.png": CHAPTER_4 + "success thesis side_hit_size 0 side_hit_size.png",
+    "side_hit_size.png": CHAPTER_4
+    + "success thesis side_hit_size 0 'factor of the hit' side_hit_size.png",
     "starts.png": """
 sb3-quad evaluate PID=pid geometric "imitation agent=itm-imitation" "RL agent=itm-recovery"
     --suite robustness --scenario starts -o starts
-success starts starts 0 starts.png
+success starts starts 0 'tilt at the start, °' starts.png
 """,
 }
 
@@ -67,8 +68,8 @@ def run(words: list[str]) -> None:
         frame(BUILD / arguments[0], int(arguments[1]), BUILD / arguments[2])
         return
     if program == "success":
-        folder, group, axis, picture = arguments
-        success(BUILD / folder, group, int(axis), BUILD / picture)
+        folder, group, axis, label, picture = arguments
+        success(BUILD / folder, group, int(axis), label, BUILD / picture)
         return
     if program == "sb3-quad":
         arguments = ["-m", "sb3_quad.cli", *arguments]
@@ -88,7 +89,7 @@ def frame(film: Path, number: int, picture: Path) -> None:
         frames.convert("RGB").save(picture, optimize=True)
 
 
-def success(folder: Path, group: str, axis: int, picture: Path) -> None:
+def success(folder: Path, group: str, axis: int, label: str, picture: Path) -> None:
     """Draw success over a number in the names of a grid's cells: the mean over the other numbers,
     in a band from the least to the greatest.
     """
@@ -99,18 +100,18 @@ def success(folder: Path, group: str, axis: int, picture: Path) -> None:
     from sb3_quad.evaluation.results import load_results
 
     results = load_results(folder)
-    _, axes = pyplot.subplots(figsize=(5.0, 3.3), layout="constrained")
     pyplot.rcParams.update(STYLE)
-    for label, colour in results.colours.items():
+    _, axes = pyplot.subplots(figsize=(5.0, 3.3), layout="constrained")
+    for controller, colour in results.colours.items():
         rows = []
         for entry in results.entries:
             name, _, cell = entry.scenario.partition(".")
-            if (name, entry.controller) == (group, label):
+            if (name, entry.controller) == (group, controller):
                 rows.append((float(cell.split("_")[axis]), entry.metrics.success.value))
         cells = pd.DataFrame(rows).groupby(0)[1].agg(["mean", "min", "max"])
-        axes.plot(cells.index, cells["mean"], "o-", color=colour, label=label, markersize=3.5)
+        axes.plot(cells.index, cells["mean"], "o-", color=colour, label=controller, markersize=3.5)
         axes.fill_between(cells.index, cells["min"], cells["max"], color=colour, alpha=0.16)
-    axes.set(xlabel=f"{group} {axis}", ylabel="success", ylim=(-0.03, 1.03))
+    axes.set(xlabel=label, ylabel="success", ylim=(-0.03, 1.03))
     axes.legend()
     pyplot.savefig(picture, dpi=150)
 
