@@ -24,9 +24,9 @@ ROWS = 256
 FEW = 128
 LINEAR, TANH, RELU = range(3)
 _0, _1, _2, _3, _4 = (np.uint64(number) for number in range(5))
-# Inputs per tile, so that their rows stay in the L1 cache
-_TILE = np.uint64(16)
+# Inputs per tile, so that their rows stay in the L1 cache: of a product, and of its gradient
 _INPUTS = 32
+_TILE = np.uint64(16)
 # Not "nnan": NaN and infinity must stay what they are
 _FAST = {"reassoc", "contract", "nsz"}
 # Beyond this, tanh is 1 in float32

@@ -19,7 +19,13 @@ from sb3_quad.envs.simulation.state import (
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.evaluation.tables import Table
 from sb3_quad.identification.curve import Curve, fit_curve, lagged
-from sb3_quad.identification.flight_log import MOTION_SIZE, Log, attitudes, rotor_columns
+from sb3_quad.identification.flight_log import (
+    MOTION_SIZE,
+    Log,
+    attitudes,
+    quaternions,
+    rotor_columns,
+)
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
 # Time before a window whose commands spin up the rotors, s
@@ -143,7 +149,7 @@ def open_loop(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> FloatArray
         time = end * vehicle.control_step
         stays[:, POSITION] = start[:, POSITION] + start[:, VELOCITY] * time
         rotation = attitudes(start) * Rotation.from_rotvec(start[:, BODY_RATES] * time)
-        stays[:, QUATERNION] = rotation.as_quat()[:, [3, 0, 1, 2]]
+        stays[:, QUATERNION] = quaternions(rotation)
         record = windows.record[windows.rows + end]
         errors.append([gaps(flown, record), gaps(stays, record)])
     squares = np.square(errors).sum(axis=4).mean(axis=3)
