@@ -280,7 +280,7 @@ def test_flights_are_shown_in_a_window():
     result = subprocess.run(
         ["xvfb-run", "-a", *command],
         cwd=Path(__file__).parent.parent,
-        env={**os.environ, "LIBGL_ALWAYS_SOFTWARE": "1"},
+        env={**os.environ, "LIBGL_ALWAYS_SOFTWARE": "1", "MPLBACKEND": "TkAgg"},
         capture_output=True,
         text=True,
         timeout=200,
