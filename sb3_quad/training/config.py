@@ -350,8 +350,10 @@ def build_config(
     check_environment(env_id)
     settings = with_absolute_paths(env_id, settings)
     # The default is written out, so that config.yml names the expert. Demonstrations from a file
-    # need none.
+    # need none, nor does APG unless it is to imitate one.
     needs_expert = takes_expert(algorithm) and not settings.get("demonstrations")
+    if algo == "apg" and not settings.get("bc_coef"):
+        needs_expert = False
     if needs_expert and settings.get("expert") is None:
         settings["expert"] = DEFAULT_EXPERT
 
