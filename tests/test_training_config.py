@@ -319,7 +319,7 @@ PIPELINES = "two_stage.yml", "imitation.yml", "robust/crazyflie.yml", "rates.yml
 )
 def test_packaged_files_hold_good_settings(name):
     algo = name.rpartition("/")[2].removesuffix(".yml")
-    algo = {"reference": "ppo_bc", "following": "apg"}.get(algo, algo)
+    algo = {"reference": "ppo_bc", "following": "apg", "worlds": "apg"}.get(algo, algo)
     assert {*ENVIRONMENTS} <= SETTINGS.read(name)[0].keys()
     for env_id in ENVIRONMENTS:
         config = load_config(algo, env_id, name)
@@ -341,8 +341,9 @@ def test_the_thesiss_expert_is_the_default_and_others_are_asked_for_by_file():
     }
     for file, expert in experts.items():
         for stage in load_pipeline(file).stages:
-            # APG learns from no expert.
-            assert stage.algo == "apg" or stage.load().expert == expert
+            # APG learns from none unless it is to imitate one.
+            assert stage.load().expert == (None if stage.algo == "apg" else expert)
+    assert build("apg", bc_coef=10.0).expert == DEFAULT_EXPERT
 
 
 SHARED = {
