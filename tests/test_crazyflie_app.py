@@ -239,7 +239,7 @@ def test_it_recovers_as_its_zip(tmp_path, name, n):
     sees = dict(settings.observation)
     firmware = Firmware(App(write(exported, tmp_path)))
     zipped, flown = (
-        fly(each, "state_recovery", n, 1000, CRAZYFLIE, 0.0, **sees).success.sum()
+        fly(each, "state_recovery", n, 600, CRAZYFLIE, 0.0, **sees).success.sum()
         for each in (load_model(agent_path(name)), firmware)
     )
     assert zipped >= n - 1 and abs(zipped - flown) <= 1
