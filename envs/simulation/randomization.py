@@ -235,10 +235,6 @@ class Randomization(Frozen):
     """added drag along each body axis, 1/s times the nominal mass, such as [0, 0.5]"""
     rotors: Factor | None = None
     """factor of the thrust and drag moment of each rotor by itself, such as [0.7, 1.15]"""
-    least_thrust_to_weight: Annotated[float, Field(ge=0, le=100)] | None = None
-    """the ratio that ``rotors`` leaves a vehicle if all its rotors were as weak as the weakest, such
-    as 1.4: weak vehicles have rotors that differ less
-    """
     rotor_drag: NonNegativeRange | None = None
     """rotor drag along each body axis in hover, 1/s times the nominal mass, in place of the
     vehicle's own, as the next five are
@@ -341,7 +337,6 @@ class Randomization(Frozen):
 RANDOMIZATION = dict.fromkeys(Randomization.model_fields, RANGE) | {
     "share": 1,
     "wrench_share": 1,
-    "least_thrust_to_weight": 1,
     **dict.fromkeys(("force", "torque", "wind"), sum(VECTOR.values())),
     **dict.fromkeys(("gusts", "wind_gusts"), sum(GUST.values())),
 }

@@ -281,10 +281,8 @@ def _randomize_air(u, table, v):
         if axis < 2:
             k = P.airspeed_moment_roll + axis
             _replace(v, k, inertia / speeds, table, R.airspeed_moment, u[6 + axis])
-    ratio = 4.0 * (v[P.thrust_middle] + v[P.thrust_half_range]) / (mass * v[P.gravity])
-    least = min(table[R.least_thrust_to_weight] / ratio, 1.0)
     for rotor in range(4):
-        factor = max(between(table, R.rotors, u[rotor], 1.0), least)
+        factor = between(table, R.rotors, u[rotor], 1.0)
         v[P.thrust_factor_0 + rotor] *= factor
         v[P.hover_share_0 + rotor] /= factor
 
