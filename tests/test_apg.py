@@ -149,12 +149,12 @@ def test_lost_flights_are_pulled_to_the_expert_and_others_are_not(monkeypatch):
         policy_kwargs={"optimizer_class": th.optim.SGD, "net_arch": [16]},
         cost=lambda flown: 0.0 * flown.r33,
         expert="geometric",
-        bc_coef=4.0,
+        lost_bc_coef=4.0,
         seed=0,
     )
     before = weights(agent)
     agent.learn(48 * 150)
-    lengths, lost = agent._tape.lengths, agent._tape.lost
+    _, lengths, lost = agent._tape.episodes()
     assert 5 < lost.sum() < 43
     after = weights(agent)
     agent.policy.load_state_dict(dict(zip(agent.policy.state_dict(), before, strict=True)))

@@ -35,9 +35,9 @@ from sb3_quad.envs.simulation.settings import KEY
 _SETTINGS = {
     "SAC": "target_entropy",
     "TD3": "policy_delay",
-    "APG": "continue_flights",
     "PPOBC": "bc_coef",
     "DAgger": "beta",
+    "APG": "continue_flights",
     "PPO": "n_epochs",
     "A2C": "gae_lambda",
 }

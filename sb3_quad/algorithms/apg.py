@@ -25,7 +25,6 @@ from sb3_quad.algorithms.common import (
     ExpertMixin,
     History,
     RateOrSchedule,
-    WeightOrSchedule,
     model_of,
     policy_arguments,
 )
@@ -142,9 +141,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         gradient, which does not say how to save them; as in
         :class:`~sb3_quad.algorithms.ppo_bc.PPOBC`. It is asked at each step, so the tape must fly
         the environment that gives it the true state.
-    :param bc_coef: Weight of this imitation, a float or a schedule: a control step of a lost flight
-        costs ``bc_coef / 2`` times the squared difference to the expert's action, a sum over the
-        action's dimensions. For random vehicles 60 is a good value.
+    :param lost_bc_coef: Weight of this imitation: a control step of a lost flight costs half of it
+        times the squared difference to the expert's action, a sum over the action's dimensions. For
+        random vehicles try 10 to 60.
     :param substeps: Physics steps per control step during training; None: the vehicle's.
     :raises ConfigError: an argument out of range, or an environment that cannot be differentiated.
     :raises TrainingError: a non-finite gradient, even in a single environment.
@@ -189,7 +188,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         cost: Callable[[Any], th.Tensor] | None = None,
         calm_coef: Weight = 0.0,
         expert: ExpertLike | None = None,
-        bc_coef: WeightOrSchedule = 0.0,
+        lost_bc_coef: Weight = 0.0,
         substeps: Count | None = 2,
         _init_setup_model: bool = True,
     ):
@@ -221,7 +220,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.own_cost = False
         self.calm_coef = calm_coef
         self.expert = expert
-        self.bc_coef = bc_coef
+        self.lost_bc_coef = lost_bc_coef
         self.substeps = substeps
 
         if _init_setup_model:
@@ -242,6 +241,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             unfit = "optimizer_kwargs: SOAP takes betas and eps; give an optimizer_class for others"
             with raised_as(ConfigError, unfit):
                 policy.optimizer = SOAP(policy.parameters(), rate, **policy.optimizer_kwargs)
+
+    def will_clone(self) -> bool:
+        """Return whether lost flights imitate an expert."""
+        return self.lost_bc_coef > 0.0
 
     def _shows_in_returns(self) -> bool:
         """Return whether the reward says what the cost says."""
@@ -288,7 +291,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.own_cost = self.cost is not None
         if self.expert is not None and not self.will_clone():
             raise ConfigError(
-                "expert: has no effect with bc_coef 0; give a bc_coef, such as 10, or no expert"
+                "expert: has no effect with lost_bc_coef 0; give a weight, such as 10, or no expert"
             )
         options: StrDict = {}
         if self.cost is not None:
@@ -420,10 +423,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         lost = np.flatnonzero(is_lost)
         counts = np.arange(self.n_steps)[:, None] < lengths[lost]
         pulls = np.array(self._differences)[:, lost] * counts[..., None]
-        bc_coef = self.bc_coef(self._current_progress_remaining)
-        self.logger.record("train/bc_coef", bc_coef)
         self.logger.record("train/bc_loss", np.square(pulls).sum() / max(counts.sum(), 1))
-        return pulls * np.float32(bc_coef / (self.n_steps * len(lengths))), lost
+        return pulls * np.float32(self.lost_bc_coef / (self.n_steps * len(lengths))), lost
 
     def _cost_rise(self, cost: float) -> float:
         """Return how far an update's cost lies above the least so far, in usual changes.

@@ -352,7 +352,7 @@ def build_config(
     # The default is written out, so that config.yml names the expert. Demonstrations from a file
     # need none, nor does APG unless it is to imitate one.
     needs_expert = takes_expert(algorithm) and not settings.get("demonstrations")
-    if algo == "apg" and not settings.get("bc_coef"):
+    if algo == "apg" and not settings.get("lost_bc_coef"):
         needs_expert = False
     if needs_expert and settings.get("expert") is None:
         settings["expert"] = DEFAULT_EXPERT
