@@ -144,7 +144,6 @@ class StageResult(NamedTuple):
 
     run: str
     agent: str
-    timesteps: int
     seconds: float
 
 
@@ -165,11 +164,6 @@ class PipelineResult(NamedTuple):
     agent: str = ""
     problem: str = ""
     exit_code: int = 0
-
-
-def is_pipeline_run(folder: Path) -> bool:
-    """Whether a folder is a pipeline's rather than a single run's."""
-    return (folder / STATUS_FILE).is_file()
 
 
 def load_pipeline(conf_file: StrPath, changes: StrMapping | None = None) -> Pipeline:
@@ -250,7 +244,8 @@ def run_pipeline(
     status = Status(stages=stages, job=dict(job), runs=[])
     content = status.model_dump(mode="json", exclude_defaults=True)
     write_yaml(folder / STATUS_FILE, content)
-    return resume_pipeline(folder, report, log_folder=jobs[0].log_folder)
+    own = jobs[0].model_dump(include={"log_folder", "tensorboard_log"})
+    return resume_pipeline(folder, report, **own)
 
 
 def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
@@ -302,11 +297,9 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
         settings = str(folder / str(stage.conf_file))
         stages.append(stage.model_copy(update={"conf_file": settings}))
     options = {**status.job, "log_folder": str(log_folder), **changes}
-    if not changes.get("tensorboard_log"):
-        refuse_outside(options.get("tensorboard_log") or ".", where, log_folder, Path())
     jobs = stage_jobs(Pipeline(stages=stages), options)
     for job in jobs:
-        refuse_elsewhere(job.config, where, log_folder)
+        refuse_elsewhere(job, where, log_folder, changes)
     runs = []
     for name in status.runs:
         refuse_outside(log_folder / name, f"{where}: runs", log_folder)
@@ -360,9 +353,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                         agent = Path(str(best.job.initial_policy))
                         problem = f"{best.label} flies this vehicle better"
                         handed = HandOver(agent, {}, problem=problem)
-                results[stage.name] = StageResult(
-                    str(run.path), str(handed.agent), run.timesteps, seconds
-                )
+                results[stage.name] = StageResult(str(run.path), str(handed.agent), seconds)
         except KeyboardInterrupt:
             if not signals.received:
                 raise
