@@ -36,8 +36,7 @@ needs_video = pytest.mark.skipif(not VIDEO, reason="the extra [video] is not ins
 
 def recovery(**changes):
     """The episodes of a task of the package."""
-    settings = FlightSettings(task="state_recovery", **changes)
-    return Setting(settings.vehicle, settings)
+    return Setting(FlightSettings(task="state_recovery", **changes))
 
 
 @pytest.fixture(scope="module")

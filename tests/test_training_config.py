@@ -342,7 +342,7 @@ def test_the_thesiss_expert_is_the_default_and_others_are_asked_for_by_file():
     for file, expert in experts.items():
         for stage in load_pipeline(file).stages:
             # APG learns from no expert.
-            assert stage.algo == "apg" or stage.load().expert == expert
+            assert stage.algo == "apg" or stage.job({}).config.expert == expert
 
 
 SHARED = {

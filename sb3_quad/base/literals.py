@@ -11,9 +11,23 @@ from sb3_quad.base.files import one_line
 from sb3_quad.base.types import StrDict
 
 CLASSES = """
-    nn.ELU nn.GELU nn.Hardtanh nn.LeakyReLU nn.Mish nn.ReLU nn.ReLU6 nn.SELU nn.Sigmoid nn.SiLU
-    nn.Softplus nn.Tanh
-    optim.Adam optim.AdamW optim.Adamax optim.RMSprop optim.SGD
+    nn.ELU
+    nn.GELU
+    nn.Hardtanh
+    nn.LeakyReLU
+    nn.Mish
+    nn.ReLU
+    nn.ReLU6
+    nn.SELU
+    nn.Sigmoid
+    nn.SiLU
+    nn.Softplus
+    nn.Tanh
+    optim.Adam
+    optim.AdamW
+    optim.Adamax
+    optim.RMSprop
+    optim.SGD
     """
 """The classes of PyTorch that settings may name."""
 _CLASS_NAME = re.compile(r"(?:torch\.|th\.)?((?:nn|optim)\..*)")

@@ -104,7 +104,6 @@ def outlook(recordings: Episode) -> FloatArray:
 class Setting(NamedTuple):
     """The episodes that all controllers fly."""
 
-    vehicle: Any  # the vehicle that experts are made for; in a scenario another one may fly
     settings: FlightSettings  # of all episodes
     # The events of an episode, by its seed
     plan: Callable[[int], Plan] = lambda seed: Plan()
@@ -125,9 +124,7 @@ def scenario_setting(
     if not colon:
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
     scenario = load_suite(suite).with_changes(vehicle=vehicle).scenario(name).flown_by(own)
-    return Setting(
-        scenario.nominal_vehicle(), scenario.settings, lambda seed: sample_plan(scenario, [seed])
-    )
+    return Setting(scenario.settings, lambda seed: sample_plan(scenario, [seed]))
 
 
 def fly_all(

@@ -188,14 +188,14 @@ class TrainingConfig(Frozen):
             refuse_unknown("eval_tasks", self.eval_tasks, TASK_NAMES)
         elif self.eval_tasks:
             raise ConfigError(f"{self.env_id} has no tasks; remove eval_tasks")
-        if self.vec_env == "batch" and not self.task:
+        elif self.vec_env == "batch":
             raise ConfigError(
                 f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc"
             )
         return self
 
     @model_validator(mode="after")
-    def _policy_fits(self) -> "TrainingConfig":
+    def _algorithm_fits(self) -> "TrainingConfig":
         aliases = self.algorithm.policy_aliases
         refuse_unknown("policy", [self.policy], aliases)
         # The policy's constructor takes these, not the algorithm's.
@@ -204,10 +204,6 @@ class TrainingConfig(Frozen):
             f"keyword of {policy.__name__}", self.policy_kwargs, constructor_parameters(policy)
         )
         check(NetArch, self.policy_kwargs.get("net_arch"), "policy_kwargs: net_arch")
-        return self
-
-    @model_validator(mode="after")
-    def _algorithm_fits(self) -> "TrainingConfig":
         check(PositiveInt, self.rollout_steps, "n_steps")
         if self.expert and not takes_expert(self.algorithm):
             raise ConfigError(f"expert: {self.algo} does not learn from an expert; remove expert")

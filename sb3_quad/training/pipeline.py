@@ -91,22 +91,18 @@ class Stage(Frozen):
     agent: Any = Field(default=None, exclude=True, repr=False)
     """the loaded agent that a single run starts from"""
 
-    def load(self) -> TrainingConfig:
-        """Return the checked settings of the stage.
+    def job(self, options: StrMapping) -> TrainingJob:
+        """Return the checked job of the stage.
 
-        :raises ConfigError: see :func:`~sb3_quad.training.config.load_config`.
+        :param options: those of :class:`~sb3_quad.training.options.JobOptions`; the evaluations of
+            the stage may differ from those of its pipeline.
+        :raises ConfigError: settings or options that do not fit.
         """
         # A settings file takes precedence over the agent's settings.
         like = None if self.conf_file else self.agent
-        return load_config(self.algo, self.env, self.conf_file, self.settings, like)
-
-    def job(self, options: StrMapping) -> TrainingJob:
-        """Return the checked job of the stage as a single run.
-
-        :param options: those of :class:`~sb3_quad.training.options.JobOptions`.
-        :raises ConfigError: settings or options that do not fit.
-        """
-        fields = {**options, "config": self.load(), "agent": self.agent}
+        config = load_config(self.algo, self.env, self.conf_file, self.settings, like)
+        own = self.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
+        fields = {**own, **options, "config": config, "agent": self.agent}
         return validate(TrainingJob, fields, "command line")
 
 
@@ -255,17 +251,13 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
     """
     jobs: list[TrainingJob] = []
     for stage in pipeline.stages:
-        where = f"stage {stage.name!r}"
-        with named(where):
-            config = stage.load()
-            _check_correction(stage, config)
-            if jobs and bool(config.normalize) != bool(jobs[-1].config.normalize):
+        with named(f"stage {stage.name!r}"):
+            made = stage.job(job)
+            _check_correction(stage, made.config)
+            if jobs and bool(made.config.normalize) != bool(jobs[-1].config.normalize):
                 raise ConfigError("normalize: must be as in the stage before, whose agent it has")
-        # The evaluations of a stage may differ from those of the pipeline.
-        own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
-        made = validate(TrainingJob, {**own, **job, "config": config}, where)
-        if stage.require and "require" in stage.model_fields_set and made.eval_episodes == 0:
-            raise ConfigError(f"{where}: require: needs evaluations; give --eval-episodes")
+            if stage.require and "require" in stage.model_fields_set and made.eval_episodes == 0:
+                raise ConfigError("require: needs evaluations; give --eval-episodes")
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
     return jobs
 

@@ -184,8 +184,7 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     # The settings of the first agent hold for all.
     first = next(filter(None, (spec.own for spec in specs)), None)
     if options.scenario is None:
-        settings = _flight_settings(options, first)
-        setting = Setting(settings.vehicle, settings)
+        setting = Setting(_flight_settings(options, first))
     elif options.env_kwargs:
         raise ConfigError("--scenario describes a whole flight; remove --env-kwargs")
     else:
@@ -193,7 +192,7 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     controllers = {}
     # What an agent observes stays as in its training, unless the command line says otherwise.
     observed = {}
-    vehicle = first_vehicle(setting.vehicle, options.env_kwargs.get("rotor_layout"))
+    vehicle = first_vehicle(setting.settings.vehicle, options.env_kwargs.get("rotor_layout"))
     for spec in specs:
         warn(spec.notice(vehicle))
         action = options.env_kwargs.get("action", "thrusts")

@@ -40,9 +40,31 @@ DEFAULT_AGENTS = (
 EXACT = 50_000  # networks with more numbers than this are rounded to half precision
 # The modules of the page in the order of their imports: those that need no browser, and the others.
 MODEL = """
-    tables vehicle dynamics rates observation network experts course flight weights gradient
+    tables
+    vehicle
+    dynamics
+    rates
+    observation
+    network
+    experts
+    course
+    flight
+    weights
+    gradient
     """
-VIEW = "fleet camera airframe scene plots hand player board controls school app"
+VIEW = """
+    fleet
+    camera
+    airframe
+    scene
+    plots
+    hand
+    player
+    board
+    controls
+    school
+    app
+    """
 EXPERTS = ("pid", "geometric")
 FEATURES = {"position", "rotation", "velocity", "body_rates"}  # as observation.js computes them
 TABLES = {
