@@ -11,6 +11,7 @@ from sb3_quad.base.errors import refuse_unknown
 from sb3_quad.base.seeds import Seed, row_seeds, seed_for
 from sb3_quad.base.types import StrDict
 from sb3_quad.base.validate import Frozen, Share, validate
+from sb3_quad.envs.batch_env import Vector
 from sb3_quad.envs.simulation.randomization import Randomization
 from sb3_quad.envs.simulation.recordings import Recording
 from sb3_quad.envs.simulation.references import Reference
@@ -18,7 +19,7 @@ from sb3_quad.envs.simulation.settings import Action, FlightSettings, Noise
 from sb3_quad.envs.simulation.tasks import T, Task, resolve_tasks
 from sb3_quad.envs.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
-from sb3_quad.evaluation.scenarios.events import Start, Vector, Wrench
+from sb3_quad.evaluation.scenarios.events import Start, Wrench
 
 # m: the tolerances of Figs. 4.6 and 4.7, and a tighter one
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
