@@ -35,7 +35,6 @@ needs_video = pytest.mark.skipif(not VIDEO, reason="the extra [video] is not ins
 
 
 def recovery(**changes):
-    """The episodes of a task of the package."""
     return Setting(FlightSettings(task="state_recovery", **changes))
 
 
