@@ -1,16 +1,18 @@
 """The part that all environments share: spaces, keywords, and reading and setting in flight."""
 
 import inspect
+import math
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import Annotated, Any, TypedDict
 
 import numpy as np
 from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from numpy.typing import ArrayLike
+from pydantic import AfterValidator
 from typing_extensions import Unpack
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, named, refuse_unknown
 from sb3_quad.base.types import AnyArray, FloatArray, StrDict, StrMapping
 from sb3_quad.base.validate import validate
 from sb3_quad.envs.simulation.batch import QuadcopterBatch, Rows, StepResult
@@ -21,7 +23,7 @@ from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.envs.simulation.randomization import Randomization
 from sb3_quad.envs.simulation.recordings import Recording
 from sb3_quad.envs.simulation.references import Reference
-from sb3_quad.envs.simulation.settings import Action, FlightSettings, Noise
+from sb3_quad.envs.simulation.settings import Action, AsList, FlightSettings, Noise
 from sb3_quad.envs.simulation.state import QUATERNION, TARGET, QuadcopterState, make_wrench
 from sb3_quad.envs.simulation.tasks import TaskSpec
 from sb3_quad.envs.simulation.vehicle_distribution import VehicleDistribution
@@ -35,6 +37,17 @@ INFOS = {
     "collision": "collision",
     "out_of_range": "out_of_range",
 }
+
+
+def _has_length(quaternion: tuple[float, ...]) -> tuple[float, ...]:
+    if math.hypot(*quaternion) < 1e-6:
+        raise ValueError("must not be zero")
+    return quaternion
+
+
+# Parts of a state, as options and files give them
+Vector = Annotated[tuple[float, float, float], AsList]
+Quaternion = Annotated[tuple[float, float, float, float], AsList, AfterValidator(_has_length)]
 
 
 class FlightKeywords(TypedDict, total=False):
@@ -100,8 +113,8 @@ class BatchEnv:
         name = type(self).__name__
         # Check the names first, so that a typo in a constructor argument is recognised, too.
         valid = inspect.signature(type(self)).parameters.keys() | FlightSettings.model_fields.keys()
-        for key in keywords.keys() - valid:
-            raise ConfigError(f"{name}: {unknown('keyword', key, valid - {'keywords'})}")
+        with named(name):
+            refuse_unknown("keyword", keywords, valid - {"keywords"})
         self.flight_settings = validate(FlightSettings, {"task": task, **keywords}, name)
         self.batch = QuadcopterBatch(n, self.flight_settings, seed, n_threads, autoreset)
 

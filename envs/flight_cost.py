@@ -91,15 +91,6 @@ def cost_and_gradients(
     return mean.item(), gradients[0].numpy(), gradients[1].numpy()
 
 
-def whole_cost(
-    cost: Callable[[FlownStates], th.Tensor], calm_coef: float, control_step: float
-) -> Callable[[FlownStates], th.Tensor]:
-    """Return a cost with ``calm_coef`` times :func:`calm_cost` added."""
-    if not calm_coef:
-        return cost
-    return lambda flown: cost(flown) + calm_coef * calm_cost(flown, control_step)
-
-
 def length(vectors: th.Tensor) -> th.Tensor:
     """Return the length of vectors (..., 3), smooth at zero."""
     return (vectors.square().sum(dim=-1) + 1e-8).sqrt()

@@ -3,7 +3,6 @@
 import math
 import sys
 from functools import partial
-from typing import Annotated
 
 import gymnasium
 import numpy as np
@@ -12,16 +11,20 @@ from typing_extensions import Unpack
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, Image, StrDict, StrMapping
 from sb3_quad.base.validate import Frozen, validate
-from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
+from sb3_quad.envs.batch_env import (
+    INFOS,
+    BatchEnv,
+    FlightKeywords,
+    Quaternion,
+    Vector,
+    quadcopter_spaces,
+)
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.envs.rendering.window import FPS, Window, has_display
 from sb3_quad.envs.simulation.checks import check_size
-from sb3_quad.envs.simulation.settings import ENDLESS, AsList
+from sb3_quad.envs.simulation.settings import ENDLESS
 from sb3_quad.envs.simulation.state import POSITION, P
 from sb3_quad.envs.simulation.tasks import TaskSpec
-
-Vector = Annotated[tuple[float, float, float], AsList]
-Quaternion = Annotated[tuple[float, float, float, float], AsList]
 
 
 class _Start(Frozen):
@@ -405,9 +408,6 @@ def _fixed_parts(options: StrMapping) -> list[tuple[str, FloatArray]]:
             continue
         values = np.array(value)
         if name == "quaternion":
-            norm = np.linalg.norm(values)
-            if norm < 1e-6:
-                raise ConfigError("options: quaternion: must not be zero")
-            values = values / norm
+            values = values / np.linalg.norm(values)
         fixed.append((name, values))
     return fixed

@@ -18,12 +18,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.types import IntArray
 from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.envs.batch_vec_env import BatchVecEnv, refuse_options
-from sb3_quad.envs.flight_cost import (
-    FlownStates,
-    cost_and_gradients,
-    flight_cost,
-    whole_cost,
-)
+from sb3_quad.envs.flight_cost import FlownStates, calm_cost, cost_and_gradients, flight_cost
 from sb3_quad.envs.infos import Infos
 from sb3_quad.envs.simulation.tape import FlightTape
 from sb3_quad.envs.simulation.tasks import TaskSpec
@@ -163,8 +158,12 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
         :param cost: the cost of each control step, in PyTorch.
         :param calm_coef: weight of :func:`~sb3_quad.envs.flight_cost.calm_cost`, which is added.
         """
-        whole = whole_cost(cost, calm_coef, self.vehicle.control_step)
-        differentiated = partial(cost_and_gradients, whole)
+        control_step = self.vehicle.control_step
+
+        def with_calm(flown: FlownStates) -> th.Tensor:
+            return cost(flown) + calm_coef * calm_cost(flown, control_step)
+
+        differentiated = partial(cost_and_gradients, with_calm if calm_coef else cost)
         return FlightTape(self.batch, n_steps, substeps, differentiated)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:

@@ -32,12 +32,13 @@ from pydantic import PositiveInt
 from stable_baselines3 import PPO
 
 from sb3_quad.agents.agent_settings import agent_settings
+from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.agents.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text, refuse_existing, replacing
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli import app
-from sb3_quad.cli.parser import OVERWRITE, SWITCH, TRUST, Flags, agent
+from sb3_quad.cli.parser import OVERWRITE, SWITCH, TRUST, Flags
 from sb3_quad.envs.simulation.frames import ObservationSettings
 from sb3_quad.envs.simulation.settings import FlightSettings, in_words
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
@@ -78,16 +79,13 @@ SHOWN = (SUCCESS, SURVIVAL, REWARD, *TIMES, MEDIAN, QUANTILE, RMS_ERROR)
 
 FLAGS: Flags = {
     "model MODEL": (
-        agent,
-        None,
         "an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC, APG) with MlpPolicy: "
-        "a zip or a run folder",
+        "a zip or a run folder"
     ),
-    "--name NAME": ({"required": True}, None, "name of the files, NAME.zip and NAME.md"),
+    "--name NAME": ({"required": True}, "name of the files, NAME.zip and NAME.md"),
     "-o FOLDER": ({"dest": "folder"}, ".", "folder for both (here)"),
     "--command TEXT": (
         {"dest": "made_by"},
-        None,
         "the command that trained it (command.txt of the run)",
     ),
     "--episodes N": (PositiveInt, 960, "episodes of each task (960; recoveries: 4 times as many)"),
@@ -116,9 +114,10 @@ def run(options: argparse.Namespace) -> int:
     film = folder / "replay.mp4"
     for path in (zip_file, card_file, *[film] * options.hub):
         refuse_existing(path, options.overwrite)
-    settings, source = agent_settings(options.model)
-    content = slim_bytes(options.model, settings if source else None)
-    command, facts = _origin(Path(options.model))
+    model = Path(agent_path(options.model))
+    settings, source = agent_settings(model)
+    content = slim_bytes(model, settings if source else None)
+    command, facts = _origin(model)
     if not source:
         facts["vehicle"] = f"{UNKNOWN}; measured on `{settings.vehicle}`"
     how = {
@@ -270,9 +269,8 @@ def write_card(
     seen = ObservationSettings.model_validate(known).model_dump(exclude_defaults=True)
     flies = f"the vehicle `{vehicle.name}`" if vehicles is None else str(vehicles)
     targets = measured[next(iter(TARGETS))].n
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    options: Any = {"undefined": jinja2.StrictUndefined, "keep_trailing_newline": True}
-    template = jinja2.Environment(loader=loader, **options).get_template("card.md.j2")
+    text = read_text(Path(__file__).with_name("card.md.j2"))
+    template = jinja2.Template(text, undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
     return template.render(
         name=name,
         frames=", ".join(f"{key}={value!r}" for key, value in seen.items()),

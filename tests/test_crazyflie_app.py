@@ -28,14 +28,12 @@ from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.export.load import load_header
-from sb3_quad.export.policy import FOLDERS, export_policy
+from sb3_quad.export.policy import HEADER, export_policy
 
 HERE = Path(__file__).resolve().parent
 STUBS = HERE / "firmware_stubs"
 sys.path.insert(0, str(HERE.parent / "examples" / "microcontroller"))
 import measure  # type: ignore[import-not-found]  # noqa: E402
-
-HEADER = FOLDERS["crazyflie"]
 
 CRAZYFLIE = load_vehicle("crazyflie")
 FIRMWARE = os.environ.get("CRAZYFLIE_FIRMWARE")

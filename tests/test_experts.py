@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import sb3_quad  # noqa: F401  (registers the environments)
 from sb3_quad.agents.resolve import resolve_expert
 from sb3_quad.base.errors import ConfigError, ExpertError
-from sb3_quad.base.imports import import_packages
+from sb3_quad.base.imports import import_name
 from sb3_quad.envs.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
 from sb3_quad.envs.simulation.state import (
     QUATERNION,
@@ -122,14 +122,14 @@ def test_a_module_of_the_current_folder_is_found_in_an_installed_command(tmp_pat
     for use in (
         lambda: resolve_expert("my_own:Pilot"),
         lambda: import_class("my_own.Callback", "callback"),
-        lambda: import_packages(["my_own"], "--gym-packages"),
+        lambda: import_name("my_own", "--gym-packages"),
     ):
         monkeypatch.setattr(sys, "path", [*before])
         monkeypatch.delitem(sys.modules, "my_own", raising=False)
         use()
         assert sys.path == [*before, str(tmp_path)]
     monkeypatch.setattr(sys, "path", [*before])
-    import_packages(["torch"], "--gym-packages")
+    import_name("torch", "--gym-packages")
     assert sys.path == before
 
 

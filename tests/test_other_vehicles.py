@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from test_pipeline import TINY
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
@@ -18,14 +19,6 @@ from sb3_quad.training.config import load_config
 
 ROOT = Path(__file__).resolve().parent.parent
 ENV = "QuadStateRecovery-v0"
-TINY = {
-    "n_envs": 8,
-    "n_steps": 16,
-    "batch_size": 64,
-    "n_timesteps": 256,
-    "env_kwargs": {"max_episode_steps": 12},
-    "policy_kwargs": {"net_arch": [8, 8]},
-}
 
 
 @pytest.fixture

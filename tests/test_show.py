@@ -25,13 +25,17 @@ from sb3_quad.envs.rendering.window import FPS
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.show.episodes import fixed_setting, fly_all, scenario_setting
+from sb3_quad.show.episodes import Setting, fly_all, scenario_setting
 from sb3_quad.show.film import HOLD, film_frames, following_camera, frame_times, write_film
 from sb3_quad.training.config import load_config
 from sb3_quad.training.runs import claim_run
 
 VIDEO = importlib.util.find_spec("imageio_ffmpeg") is not None
 needs_video = pytest.mark.skipif(not VIDEO, reason="the extra [video] is not installed")
+
+
+def recovery(**changes):
+    return Setting(FlightSettings(task="state_recovery", **changes))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +48,7 @@ def fall():
 
 def test_a_recording_is_the_flight_of_the_environment():
     expert = PIDExpert()
-    setting = fixed_setting(FlightSettings(task="state_recovery", max_episode_steps=40))
+    setting = recovery(max_episode_steps=40)
     ((recording,),) = fly_all({"pid": expert}, setting, 3, None)
     env = QuadcopterEnv(task="state_recovery")
     env.reset(seed=3)
@@ -64,7 +68,7 @@ def test_a_lost_flight_ends_where_it_was_lost(fall):
 
 
 def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
-    setting = fixed_setting(FlightSettings(task="state_recovery", max_episode_steps=20))
+    setting = recovery(max_episode_steps=20)
     still = np.zeros((1, 4))
     episodes = list(fly_all({"a": PIDExpert(), "b": lambda observation: still}, setting, 5, 50))
     assert [len(a.times) - 1 for a, _ in episodes] == [20, 20, 10]
@@ -75,7 +79,7 @@ def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
 
 
 def test_a_controller_that_fails_is_named():
-    setting = fixed_setting(FlightSettings(task="state_recovery"))
+    setting = recovery()
     with pytest.raises(ControllerError, match="odd"):
         list(fly_all({"odd": lambda observation: np.zeros((1, 3))}, setting, 0, 5))
 

@@ -34,67 +34,29 @@ HOVER_SPEED = 1000.0
 LARGEST_STEP = {"euler": 1.0, "exact": 2.0}
 # Up to this step, s, the compiled rotation is exact.
 MAX_PHYSICS_STEP = 0.0025
+_NAMES = """
+    mass ixx iyy izz thrust_coefficient motor_gain_up motor_gain_down exact_motors gravity
+    drag_x drag_y drag_z hover_thrust thrust_middle thrust_half_range battery
+    shared_saturation collision_radius delay
+    roll_arm_0 roll_arm_1 roll_arm_2 roll_arm_3
+    pitch_arm_0 pitch_arm_1 pitch_arm_2 pitch_arm_3
+    yaw_arm_0 yaw_arm_1 yaw_arm_2 yaw_arm_3
+    hover_share_0 hover_share_1 hover_share_2 hover_share_3
+    rotor_drag_x rotor_drag_y rotor_drag_z translational_lift
+    airspeed_moment_roll airspeed_moment_pitch rate_damping_x rate_damping_y rate_damping_z
+    rotor_inertia ground_effect_radius
+    thrust_factor_0 thrust_factor_1 thrust_factor_2 thrust_factor_3
+    """
 # The parameters of a vehicle that the compiled kernel needs: the rows of an array (parameters, n),
-# in the order of Vehicle.parameters()
-PARAMETER_NAMES = (
-    "mass",
-    "ixx",
-    "iyy",
-    "izz",
-    "thrust_coefficient",
-    "motor_gain_up",
-    "motor_gain_down",
-    "exact_motors",
-    "gravity",
-    "drag_x",
-    "drag_y",
-    "drag_z",
-    "hover_thrust",
-    "thrust_middle",
-    "thrust_half_range",
-    "battery",
-    "shared_saturation",
-    "collision_radius",
-    "delay",
-    "roll_arm_0",
-    "roll_arm_1",
-    "roll_arm_2",
-    "roll_arm_3",
-    "pitch_arm_0",
-    "pitch_arm_1",
-    "pitch_arm_2",
-    "pitch_arm_3",
-    "yaw_arm_0",
-    "yaw_arm_1",
-    "yaw_arm_2",
-    "yaw_arm_3",
-    "hover_share_0",
-    "hover_share_1",
-    "hover_share_2",
-    "hover_share_3",
-    # Those of simulation/aerodynamics.py, which are loaded where a vehicle has some
-    "rotor_drag_x",
-    "rotor_drag_y",
-    "rotor_drag_z",
-    "translational_lift",
-    "airspeed_moment_roll",
-    "airspeed_moment_pitch",
-    "rate_damping_x",
-    "rate_damping_y",
-    "rate_damping_z",
-    "rotor_inertia",
-    "ground_effect_radius",
-    "thrust_factor_0",
-    "thrust_factor_1",
-    "thrust_factor_2",
-    "thrust_factor_3",
-    *RATE_PARAMETERS,
-)
+# in the order of Vehicle.parameters(). Those from rotor_drag_x on, for the most part of
+# simulation/aerodynamics.py, are loaded where a vehicle needs them.
+PARAMETER_NAMES = (*_NAMES.split(), *RATE_PARAMETERS)
 # A name is a part of file names, and of what reports and exported files say.
 # Of blanks, it may hold the space alone, since others end a line.
 NAME = r"^([^/\\<>\p{C}\p{Z}]| ){1,100}$"
 NonNegative = Annotated[float, Field(ge=0.0, le=LARGEST)]
 Limits = tuple[NonNegative, Quantity]
+ByAxis = tuple[NonNegative, NonNegative, NonNegative]
 # Below, nothing spins up or falls within a flight.
 Rate = Annotated[float, Field(ge=0.01, le=LARGEST)]
 Moment = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
@@ -151,9 +113,9 @@ class Vehicle(Frozen):
     """k_m of a rotor that slows down, 1/s"""
     motor_integration: Literal["euler", "exact"] = "euler"
     """euler: Eq. 4.1 as printed; exact: the exponential, and the thrust at the middle of a step"""
-    drag: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
+    drag: ByAxis = (0.0, 0.0, 0.0)
     """d of the drag -d (v - wind) along each body axis, N s/m (Faessler et al. 2018)"""
-    rotor_drag: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
+    rotor_drag: ByAxis = (0.0, 0.0, 0.0)
     """k of the drag -k Σω (v - wind) along each body axis, with the sum of the rotor speeds, kg/rad
     """
     translational_lift: NonNegative = 0.0
@@ -163,7 +125,7 @@ class Vehicle(Frozen):
     kg m/rad; positive: it turns the thrust against the airspeed, so the nose rises in forward
     flight
     """
-    rate_damping: tuple[NonNegative, NonNegative, NonNegative] = (0.0, 0.0, 0.0)
+    rate_damping: ByAxis = (0.0, 0.0, 0.0)
     """d of the moment -d ω about each body axis, N m s"""
     rotor_inertia: NonNegative = 0.0
     """moment of inertia of a rotor about its axis, kg m^2: gyroscopic moment and yaw reaction"""

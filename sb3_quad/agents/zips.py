@@ -88,7 +88,7 @@ def _algorithm(data: StrDict) -> str:
     raise ConfigError(f"its algorithm is unknown; known are {', '.join(_SETTINGS)}")
 
 
-def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
+def load_model(path: StrPath) -> BaseAlgorithm:
     """Return the model in an SB3 ``.zip``, ready for ``predict``.
 
     It may be of PPO, A2C, SAC, TD3 or DDPG of Stable-Baselines3, or of this package. Its
@@ -97,7 +97,7 @@ def load_model(path: StrPath, device: str = "cpu") -> BaseAlgorithm:
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, an unknown algorithm,
         parameters that are not finite, or a file that may run code.
     """
-    model: BaseAlgorithm = load_zip(None, path, device=device)
+    model: BaseAlgorithm = load_zip(None, path, device="cpu")
     for parameter, tensor in model.policy.state_dict().items():
         if not th.isfinite(tensor).all():
             raise ConfigError(

@@ -30,7 +30,7 @@ from sb3_quad.algorithms.labelling import (
     refuse_other_action,
 )
 from sb3_quad.algorithms.networks import Terms, network_of, one_thread
-from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
+from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.plugins import FLIGHT_SETTINGS, plugin
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
@@ -78,9 +78,8 @@ class ExpertMixin(BaseAlgorithm):
     expert: ExpertLike | None = None
     # Queries the expert, and keeps a recurrent expert's state.
     _labeller: Labeller | None = None
-    # Return and length of each environment's first episode and of its last one
-    _first_episodes: dict[int, tuple[float, float]]
-    _last_episodes: dict[int, tuple[float, float]]
+    # By environment, return and length of its first episode and of its last one
+    _episodes: dict[int, tuple[Any, Any]]
     check_expert: bool = True
     # Further attributes that are not saved.
     _not_saved: tuple[str, ...] = ()
@@ -93,14 +92,6 @@ class ExpertMixin(BaseAlgorithm):
         if expert is not None and self.env is not None:
             self._labeller = labeller_for(expert, self.env, self._labeller, self.check_expert)
         self.expert = expert
-
-    def _check_expert(self) -> None:
-        if self.expert is None:
-            name = type(self).__name__
-            raise ExpertError(
-                f"{name} needs an expert to clone: {name}(..., expert='geometric'),"
-                " model.set_expert(...), or bc_coef=0"
-            )
 
     def will_clone(self) -> bool:
         """Return whether learning asks the expert: whether the cloning term ever has a weight.
@@ -203,9 +194,9 @@ class ExpertMixin(BaseAlgorithm):
             self._labeller = labeller_for(self.expert, self.env, self._labeller, self.check_expert)
         with network_of(self.policy).learning():
             super().learn(*arguments, **keywords)  # type: ignore[safe-super]
-        if len(self._first_episodes) >= _COMPARED:
-            first = np.array([*self._first_episodes.values()])
-            warn_if_worse(type(self).__name__, first, np.array([*self._last_episodes.values()]))
+        if len(self._episodes) >= _COMPARED:
+            first, last = np.array([*self._episodes.values()]).transpose(1, 0, 2)
+            warn_if_worse(type(self).__name__, first, last)
         return self
 
     def _shows_in_returns(self) -> bool:
@@ -233,8 +224,7 @@ class ExpertMixin(BaseAlgorithm):
             self._labeller.look(observations, dones)
 
     def _setup_learn(self, *arguments: Any, **keywords: Any) -> Any:
-        self._first_episodes = {}
-        self._last_episodes = {}
+        self._episodes = {}
         before, planned = self._last_obs, getattr(self, "_total_timesteps", 0)
         results = super()._setup_learn(*arguments, **keywords)
         if self._last_obs is not before:
@@ -259,8 +249,9 @@ class ExpertMixin(BaseAlgorithm):
             for row, info in zip(rows.tolist(), infos, strict=True):
                 episode = info.get("episode")
                 if episode is not None and self._shows_in_returns():
-                    self._last_episodes[row] = (episode["r"], episode["l"])
-                    self._first_episodes.setdefault(row, self._last_episodes[row])
+                    last = (episode["r"], episode["l"])
+                    first, _ = self._episodes.get(row, (last, last))
+                    self._episodes[row] = (first, last)
         super()._update_info_buffer(infos, dones)
 
     def _refuse_dict_observations(self) -> None:
@@ -296,8 +287,7 @@ class ExpertMixin(BaseAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         # No object of this package may be pickled: PPO.load must work where it is not installed.
-        own = ["expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
-        own += ["_first_episodes", "_last_episodes"]
+        own = ["expert", "_labeller", "_episodes", "rollout_buffer_class", "rollout_buffer_kwargs"]
         return [*super()._excluded_save_params(), *own, *self._not_saved]
 
 
@@ -404,13 +394,10 @@ def policy_arguments(given: StrDict | None, initial: Any, log_std_init: float) -
         features extractor, and its log_std stays.
     :param log_std_init: the default of a model that starts from scratch.
     """
-    arguments: StrDict = {}
+    arguments: StrDict = {"log_std_init": log_std_init}
     if isinstance(initial, OnPolicyAlgorithm):
-        for name in _OF_NETWORKS:
-            if name in initial.policy_kwargs:
-                arguments[name] = initial.policy_kwargs[name]
-    else:
-        arguments["log_std_init"] = log_std_init
+        theirs = initial.policy_kwargs
+        arguments = {name: theirs[name] for name in _OF_NETWORKS if name in theirs}
     return arguments | (given or {})
 
 

@@ -307,11 +307,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         seed = self._entropy if self.seed is None else self.seed
         return np.random.default_rng([seed, purpose, self._n_updates])
 
-    def _raw_observations(self, normalize: Any) -> Any:
-        """Return the present observations as they were before VecNormalize."""
-        latest, raw = self._raw
-        return raw if latest is self._last_obs else normalize.get_original_obs()
-
     def collect_rollouts(
         self,
         env: VecEnv,
@@ -350,7 +345,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             # policy.
             observations = self._last_obs
             if normalize:
-                raw[step] = self._raw_observations(normalize)
+                latest, known = self._raw
+                raw[step] = known if latest is observations else normalize.get_original_obs()
             means = network.means(observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert[step] = rng.random(env.num_envs) < beta

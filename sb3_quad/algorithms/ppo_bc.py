@@ -38,7 +38,7 @@ from sb3_quad.algorithms.losses import (
     max_clipped_value_loss,
 )
 from sb3_quad.algorithms.networks import Network, network_of
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.base.validate import Count, Natural, Share, Weight, check
 
@@ -225,7 +225,11 @@ class PPOBC(ExpertMixin, PPO):
         self.bc_coef = FloatSchedule(float(bc_coef))
 
     def _check_cloning(self) -> None:
-        self._check_expert()
+        if self.expert is None:
+            raise ExpertError(
+                "PPOBC needs an expert to clone: PPOBC(..., expert='geometric'),"
+                " model.set_expert(...), or bc_coef=0"
+            )
         refuse_wide_actions(self.action_space)
         if self.use_sde and self.bc_loss == "nll":
             raise ConfigError(

@@ -65,14 +65,15 @@ def named(where: str) -> Iterator[None]:
         raise ConfigError(f"{where}: {error}") from None
 
 
-def refuse_unknown(kind: str, names: Iterable[str], valid: Collection[str]) -> None:
+def refuse_unknown(kind: str, names: Iterable[str], valid: Collection[str], more: str = "") -> None:
     """Refuse names that are not among the valid ones.
 
+    :param more: ends the message.
     :raises ConfigError: with the message of :func:`unknown`.
     """
     for name in names:
         if name not in valid:
-            raise ConfigError(unknown(kind, name, valid))
+            raise ConfigError(unknown(kind, name, valid) + more)
 
 
 def unknown(kind: str, name: object, valid: Iterable[str]) -> str:

@@ -6,7 +6,7 @@ import os
 import pkgutil
 import re
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError, MissingExtra, raised_as
@@ -50,28 +50,16 @@ def import_name(text: str, where: str) -> Any:
         return pkgutil.resolve_name(text)
 
 
-def import_packages(packages: Iterable[str], where: str) -> None:
-    """Import modules that the user names, such as those that register further environments.
-
-    :param where: The flag or key that names them, for the error message.
-    :raises ConfigError: A module cannot be imported.
-    """
-    for package in packages:
-        import_name(package, where)
-
-
 def require(module: str, extra: str, what: str) -> Any:
     """Import a module that only some features need.
 
-    :param extra: The extra of this package that installs it, or an empty text.
+    :param extra: The extra of this package that installs it.
     :param what: The feature, for the error message.
     :raises MissingExtra: It cannot be imported. The message says what to install.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        if extra:
-            install = f"'.[{extra}]' from a clone of sb3_quad"
-        else:
-            install = module.replace("_", "-")
-        raise MissingExtra(f"{what} needs {module} ({error}): pip install {install}") from None
+        raise MissingExtra(
+            f"{what} needs {module} ({error}): pip install '.[{extra}]' from a clone of sb3_quad"
+        ) from None

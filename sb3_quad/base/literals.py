@@ -10,25 +10,25 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line
 from sb3_quad.base.types import StrDict
 
-CLASSES = (
-    "nn.ELU",
-    "nn.GELU",
-    "nn.Hardtanh",
-    "nn.LeakyReLU",
-    "nn.Mish",
-    "nn.ReLU",
-    "nn.ReLU6",
-    "nn.SELU",
-    "nn.Sigmoid",
-    "nn.SiLU",
-    "nn.Softplus",
-    "nn.Tanh",
-    "optim.Adam",
-    "optim.AdamW",
-    "optim.Adamax",
-    "optim.RMSprop",
-    "optim.SGD",
-)
+CLASSES = """
+    nn.ELU
+    nn.GELU
+    nn.Hardtanh
+    nn.LeakyReLU
+    nn.Mish
+    nn.ReLU
+    nn.ReLU6
+    nn.SELU
+    nn.Sigmoid
+    nn.SiLU
+    nn.Softplus
+    nn.Tanh
+    optim.Adam
+    optim.AdamW
+    optim.Adamax
+    optim.RMSprop
+    optim.SGD
+    """
 """The classes of PyTorch that settings may name."""
 _CLASS_NAME = re.compile(r"(?:torch\.|th\.)?((?:nn|optim)\..*)")
 
@@ -118,8 +118,9 @@ def _resolve(value: Any, key: str) -> Any:
     match = _CLASS_NAME.fullmatch(value)
     if match is None:
         return parse_number(value)
-    if match[1] not in CLASSES:
-        raise ConfigError(f"{key}: {unknown('class', value, CLASSES)}")
+    valid = CLASSES.split()
+    if match[1] not in valid:
+        raise ConfigError(f"{key}: {unknown('class', value, valid)}")
     return pkgutil.resolve_name(f"torch.{match[1]}")
 
 

@@ -1,11 +1,9 @@
 """Validated data: one base class for records and settings, and one-line errors."""
 
-import json
 import math
 import re
 import typing
 from collections.abc import Callable, Iterable
-from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import (
@@ -21,7 +19,6 @@ from pydantic import (
 )
 
 from sb3_quad.base.errors import ConfigError, refuse_unknown
-from sb3_quad.base.files import read_text
 from sb3_quad.base.types import StrMapping
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -165,19 +162,6 @@ def check(kind: Any, value: Any, where: str, strict: bool = False) -> Any:
     # Pydantic's own messages are good enough for the others.
     expected = [*ranges, *known, *messages.values()][0].removeprefix("Input should be ")
     raise ConfigError(f"{where} is {value!r}, must be {expected}")
-
-
-def read_record(path: Path, model: type[Model]) -> Model:
-    """Return the record in a JSON file.
-
-    :raises ConfigError: The file is missing, is not JSON, or holds another record.
-    """
-    text = read_text(path)
-    try:
-        return validate(model, json.loads(text), "damaged, or of another version")
-    except (ValueError, RecursionError) as error:
-        # ValueError: the text is not JSON, or validate() raised its ConfigError.
-        raise ConfigError(f"{path}: {error}; name another folder, or remove it") from None
 
 
 def explain(error: ValidationError) -> str:

@@ -8,9 +8,8 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.files import one_line, read_text, write_text
-from sb3_quad.base.trees import walk
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
 
 # The most characters of a text, which take a few seconds
@@ -26,7 +25,7 @@ class Loader(yaml.SafeLoader):
 
     def get_single_node(self) -> Any:
         root = super().get_single_node()
-        walk(root, _parts, 100_000 + len(self.buffer))
+        _walk(root, 100_000 + len(self.buffer))
         return root
 
     def compose_mapping_node(self, anchor: Any) -> Any:
@@ -51,10 +50,26 @@ class Loader(yaml.SafeLoader):
         raise ValueError(f"{tag}: no such value in settings")
 
 
-def _parts(node: Any) -> list[Any]:
-    """Return the parts of a YAML node, which are pairs for a mapping."""
+def _walk(node: Any, most: int, deepest: int = 50) -> int:
+    """Walk over everything that a YAML node contains, and return how much of ``most`` is left.
+
+    A few lines of a file can contain a node so many times, or so deep, that a program that copies
+    or shows it never ends. Here each one counts as often as it occurs.
+
+    :param most: the maximum number of nodes.
+    :param deepest: the maximum depth.
+    :raises ValueError: there are more, or one contains itself.
+    """
+    # The parts of a mapping are pairs of nodes.
     parts = getattr(node, "value", node)
-    return [] if isinstance(parts, str) else list(parts or ())
+    if isinstance(parts, str):
+        return most
+    for part in parts or ():
+        most -= 1
+        if most < 0 or deepest == 0:
+            raise ValueError("too many values, or too deep; one that is repeated counts each time")
+        most = _walk(part, most, deepest - 1)
+    return most
 
 
 Loader.add_multi_constructor("tag:yaml.org,2002:python/", Loader.construct_python)
@@ -145,10 +160,7 @@ class YamlFolder(NamedTuple):
         :raises ConfigError: An unknown name.
         """
         files = self._files()
-        if name not in files:
-            raise ConfigError(
-                f"{unknown(self.kind, name, files)}, or the path of a {self.suffix} file"
-            )
+        refuse_unknown(self.kind, [name], files, f", or the path of a {self.suffix} file")
         return files[name]
 
     def read(self, source: StrPath) -> tuple[dict[Any, Any], str]:

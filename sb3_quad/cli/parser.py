@@ -15,7 +15,6 @@ from typing import Any, NoReturn, TypeAlias
 from pydantic import BaseModel
 from rich_argparse import RawDescriptionRichHelpFormatter
 
-from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.types import StrDict
@@ -133,14 +132,6 @@ def seed(text: str) -> int:
     return number
 
 
-def agent(text: str) -> str:
-    """Return the path of an agent's zip, see :func:`~sb3_quad.agents.pretrained.agent_path`."""
-    try:
-        return agent_path(text)
-    except ConfigError as error:
-        raise ArgumentTypeError(str(error)) from None
-
-
 KINDS = {bool: SWITCH, StrDict: PAIRS, str: str}
 """The types (or keywords of ``add_argument``) of flags by those of their fields.
 
@@ -212,13 +203,3 @@ def given(options: Namespace, *names: str) -> StrDict:
     """Return those of some options that the command has and that were given."""
     values = vars(options)
     return {name: values[name] for name in names if values.get(name) is not None}
-
-
-def refuse_with_resume(options: Namespace, *names: str) -> None:
-    """Refuse settings next to ``--resume``.
-
-    :raises ConfigError: one of them is given.
-    """
-    for name in given(options, *names):
-        flag = name.replace("_", "-")
-        raise ConfigError(f"--resume keeps the settings of what it resumes; remove --{flag}")

@@ -77,14 +77,13 @@ def evaluate(
             except SB3QuadError as error:
                 message = " ".join(str(error).split())
                 results.failures.append(f"{spec.label}, {scenario.name}: {message}")
-                continue
-            write_arrays(place / entry.flights, compressed=True, **arrays)
-            results.entries.append(entry)
+            else:
+                write_arrays(place / entry.flights, compressed=True, **arrays)
+                results.entries.append(entry)
             # Write after each one, so that an interrupted evaluation can resume.
-            write_text(place / RESULTS, results.model_dump_json(indent=2))
+            if results.entries:
+                write_text(place / RESULTS, results.model_dump_json(indent=2))
         progress(len(jobs), len(jobs), "")
-        if results.entries:
-            write_text(place / RESULTS, results.model_dump_json(indent=2))
     return results
 
 
@@ -98,7 +97,7 @@ def _report_vehicles(suite: Suite, specs: Sequence[ControllerSpec], report: Repo
         # Several scenarios give the same notice: report it once.
         notices = dict[str, None]()
         for scenario in suite.scenarios:
-            vehicle = _flown_by(spec, scenario).nominal_vehicle()
+            vehicle = scenario.flown_by(spec.own).nominal_vehicle()
             notices[spec.notice(vehicle)] = None
             # All fly the vehicle that a scenario names.
             if scenario.vehicle is None:
@@ -110,13 +109,6 @@ def _report_vehicles(suite: Suite, specs: Sequence[ControllerSpec], report: Repo
     if len({*flown.values()}) > 1:
         who = ", ".join(map(" flies ".join, flown.items()))
         report(f"not all fly the same vehicle: {who}; --vehicle gives all of them one")
-
-
-def _flown_by(spec: ControllerSpec, scenario: Scenario) -> Scenario:
-    """The scenario with the vehicle that the controller flies."""
-    if spec.own is None:
-        return scenario
-    return scenario.flown_by(spec.own.vehicle)
 
 
 def _flown_before(folder: Path, results: Results) -> list[Entry]:
@@ -168,7 +160,7 @@ def _fly(spec: ControllerSpec, scenario: Scenario) -> tuple[Entry, Arrays]:
 
     :return: its entry, and the arrays of its flights (``flightlog.py``).
     """
-    flown = _flown_by(spec, scenario)
+    flown = scenario.flown_by(spec.own)
     action = flown.settings.action
     controller = resolve_expert(spec.spec, flown.nominal_vehicle(), "controller", action=action)
     # A model from a factory says only now what it observes.

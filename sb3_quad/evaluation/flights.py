@@ -35,12 +35,11 @@ from sb3_quad.base.types import (
 )
 from sb3_quad.envs import MAX_EPISODE_STEPS
 from sb3_quad.envs.batch_env import quadcopter_spaces
-from sb3_quad.envs.simulation.batch import MAX_ROWS
+from sb3_quad.envs.simulation.batch import MAX_ROWS, QuadcopterBatch
 from sb3_quad.envs.simulation.checks import per_row, whole_number
-from sb3_quad.envs.simulation.settings import FlightSettings
+from sb3_quad.envs.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.envs.simulation.state import TARGET
 from sb3_quad.envs.vehicles.vehicle import Vehicle, first_vehicle
-from sb3_quad.evaluation.fleets import Fleet
 from sb3_quad.evaluation.following import Following
 from sb3_quad.evaluation.hooks import Arrivals, Course, Hook, Motion
 from sb3_quad.evaluation.hover import HOVERED, Hover
@@ -227,7 +226,10 @@ def fly_settings(
     refuse_other_action(type(controller).__name__, controller, settings.action)
     seen: list[Float32Array] = []
     done: list[Float32Array] = []
-    fleet = Fleet(seeds, settings)
+    # Rows that are lost stay so, and flights end by their plan.
+    endless = settings.with_changes(max_episode_steps=ENDLESS)
+    fleet = QuadcopterBatch(len(seeds), endless, autoreset=False)
+    fleet.seed(seeds)
     with one_thread_by_default():
         observations, _ = quadcopter_spaces(fleet.observation.size)
         pilot = Controller(
@@ -243,7 +245,10 @@ def fly_settings(
         ]
         watching = [*measuring, *hooks]
         control_step = fleet.vehicle_list[0].control_step
-        observation = fleet.begin(plan.start)
+        fleet.reset()
+        for name, values in plan.start.items():
+            fleet.fix(name, values.T)
+        observation = fleet.observe()
         # The state is a live view: copy what later steps need.
         state = fleet.true_state()
         start = state.copy()

@@ -196,9 +196,7 @@ def metric_rows(
 
 def overview(results: Results) -> list[Table]:
     """Return the tables of all scenarios; the last one says how to read them."""
-    tables = []
-    for scenarios in scenario_groups(results):
-        tables.append(group_table(results, scenarios))
+    tables = [group_table(results, scenarios) for scenarios in scenario_groups(results)]
     tables[-1] = tables[-1]._replace(caption=CAPTION)
     return tables
 

@@ -68,10 +68,11 @@ def correct_offset(
     try:
         before = after = hover_offset(model, seed=seed, settings=own)
         if scale != 1.0:
-            scale_position(model, scale)
+            with th.no_grad():
+                layer.weight[:, _POSITION] /= scale
             after = hover_offset(model, seed=seed, settings=own)
         for seed_of_round in row_seeds(seed, ROUNDS):
-            shift_position(model, after, std[_POSITION])
+            shift_position(layer, after / std[_POSITION])
             after = hover_offset(model, seed=seed_of_round, settings=own)
     except BaseException:
         layer.load_state_dict(weights)
@@ -103,21 +104,12 @@ def hover_offset(
     return np.asarray(flights.final_offset[flights.survival].mean(axis=0))
 
 
-def shift_position(model: BaseAlgorithm, offset: FloatArray, std: FloatArray) -> None:
-    """Shift the position that the actor sees by ``offset`` (m, world frame).
-
-    :param std: σ of the position features, (3,), by which they are divided.
+def shift_position(layer: th.nn.Linear, offset: FloatArray) -> None:
+    """Shift the position that an actor's first layer sees by ``offset``, (3,), world frame, in σ of
+    its features.
     """
-    layer = first_layer(model)
     with th.no_grad():
-        shift = th.as_tensor(offset / std, dtype=layer.weight.dtype, device=layer.weight.device)
-        layer.bias.add_(layer.weight[:, _POSITION] @ shift)
-
-
-def scale_position(model: BaseAlgorithm, scale: float) -> None:
-    """Let the actor see its distance from the target divided by ``scale`` (α)."""
-    with th.no_grad():
-        first_layer(model).weight[:, _POSITION] /= scale
+        layer.bias.add_(layer.weight[:, _POSITION] @ layer.weight.new_tensor(offset))
 
 
 def first_layer(model: BaseAlgorithm) -> th.nn.Linear:

@@ -1,14 +1,11 @@
 """The report of an evaluation: its tables as Markdown, ``report.md``, and its plots as PNG."""
 
-from collections.abc import Iterator, Sequence
 from html import escape
 from pathlib import Path
 
-from matplotlib.figure import Figure
-
 from sb3_quad.base.files import write_text
 from sb3_quad.base.types import StrPath
-from sb3_quad.evaluation.flightlog import read_tracks
+from sb3_quad.evaluation.flightlog import Track, read_tracks
 from sb3_quad.evaluation.metric_tables import CAPTION, group_table, scenario_groups
 from sb3_quad.evaluation.plots import paths_plot, save_figure
 from sb3_quad.evaluation.results import FIGURES, REPORT, Results, load_results
@@ -33,9 +30,12 @@ def write_report(folder: StrPath) -> Path:
     for scenarios in scenario_groups(results):
         parts += [f"## {escape(scenarios[0].heading)}", escape(scenarios[0].description)]
         parts.append(group_table(results, scenarios).markdown())
-        for name, figure in _figures(results, scenarios, place):
+        # The cells that vary makes have no plot.
+        flights = _flights(results, scenarios[0], place) if len(scenarios) == 1 else {}
+        if flights:
+            name = f"{scenarios[0].name}_paths"
             picture = f"{FIGURES}/{name}.png"
-            save_figure(figure, place / picture)
+            save_figure(paths_plot(flights, results.colours), place / picture)
             parts.append(f"![{name}]({picture})")
     write_text(place / REPORT, "\n\n".join(filter(None, parts)) + "\n")
     return place / REPORT
@@ -53,18 +53,11 @@ def _vehicles(results: Results) -> str:
     return ", ".join(sorted(names))
 
 
-def _figures(
-    results: Results, scenarios: Sequence[Scenario], folder: Path
-) -> Iterator[tuple[str, Figure]]:
-    """Yield the plot of a scenario with its name; none of the cells that ``vary`` makes."""
-    first, *others = scenarios
-    if others:
-        return
+def _flights(results: Results, scenario: Scenario, folder: Path) -> dict[str, list[Track]]:
+    """Return the flights of a scenario by label; none of controllers that failed."""
     flights = {}
     for label in results.colours:
-        entry = results.entry(label, first.name)
+        entry = results.entry(label, scenario.name)
         if entry is not None:
             flights[label] = read_tracks(folder / entry.flights)
-    # A scenario in which all controllers failed has no flights to draw.
-    if flights:
-        yield f"{first.name}_paths", paths_plot(flights, results.colours)
+    return flights

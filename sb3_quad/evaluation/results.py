@@ -7,6 +7,7 @@
 A number that does not exist is None, never NaN.
 """
 
+import json
 import re
 from pathlib import Path
 from typing import Annotated, Literal
@@ -14,8 +15,9 @@ from typing import Annotated, Literal
 from pydantic import FailFast
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import read_text
 from sb3_quad.base.types import StrPath
-from sb3_quad.base.validate import Frozen, read_record
+from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import colours_of
@@ -94,7 +96,12 @@ def load_results(folder: StrPath) -> Results:
     path = Path(folder) / RESULTS
     if not path.is_file():
         raise ConfigError(f"{path}: no such file; evaluate writes it")
-    return read_record(path, Results)
+    text = read_text(path)
+    try:
+        return validate(Results, json.loads(text), "damaged, or of another version")
+    except (ValueError, RecursionError) as error:
+        # ValueError: the text is not JSON, or validate() raised its ConfigError.
+        raise ConfigError(f"{path}: {error}; name another folder, or remove it") from None
 
 
 def file_name(label: str) -> str:

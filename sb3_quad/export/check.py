@@ -220,13 +220,10 @@ def features_of(
     n_ahead = 3 * len(trained.observation.preview or ())
     features = observation[:, :OBSERVATION_SIZE] * trained.std + trained.mean
     ahead = observation[:, observation.shape[1] - n_ahead :] * ACCELERATION_STD
-    # From the world's axes to the reference's heading
+    # From the world's axes to the reference's heading, column by column
     cosine, sine = state.target_heading.T
-    turns = np.zeros((state.n, 3, 3))
-    turns[:, 0, 0] = turns[:, 1, 1] = cosine
-    turns[:, 0, 1] = sine
-    turns[:, 1, 0] = -sine
-    turns[:, 2, 2] = 1.0
+    zero = np.zeros(state.n)
+    turns = np.array([[cosine, -sine, zero], [sine, cosine, zero], [zero, zero, zero + 1.0]]).T
     if trained.observation.position_integral is not None:
         # The policy sees the position with the integral added, which the file adds itself.
         offset = (state.position - state.target)[:, :, None]

@@ -2,7 +2,6 @@
 
 import hashlib
 import re
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,22 +18,17 @@ from sb3_quad.base.types import StrDict, StrPath
 from sb3_quad.envs.simulation.observation import FEATURES, GROUPS
 from sb3_quad.envs.simulation.settings import FlightSettings
 from sb3_quad.envs.vehicles.vehicle import VehicleSource, first_vehicle, load_vehicle
-from sb3_quad.export import crazyflie, load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, TrainedPolicy, compare
 from sb3_quad.export.cost import cost_of
-from sb3_quad.export.crazyflie import plan_app
+from sb3_quad.export.crazyflie import FILES, plan_app
+from sb3_quad.export.load import load_header, load_onnx
 from sb3_quad.export.network import Network, build_network, write_onnx
 
 # Formats, with the suffixes of their files or folders
 FORMATS = {"onnx": ".onnx", "c": ".h", "crazyflie": "_crazyflie"}
-# Formats that are folders, with the file that contains the policy
-FOLDERS = {"crazyflie": "src/policy.h"}
-# The other files in them; the template of FILE is FORMAT.FILE.j2, with . for /.
-FILES = {"crazyflie": crazyflie.FILES}
-
-Write = Callable[[Network, StrDict], bytes]
-Read = Callable[[bytes, int], tuple[load.Call, str]]
+APP = "crazyflie"  # the format that is a folder, and the file in it that contains the policy
+HEADER = "src/policy.h"
 
 
 class Export(NamedTuple):
@@ -88,11 +82,12 @@ def export_policy(
             "letters, digits and underscores, a letter first"
         )
     refuse_unknown("format", [file_format], FORMATS)
-    if file_format in FOLDERS and output != "thrusts":
+    is_app = file_format == APP
+    if is_app and output != "thrusts":
         raise ConfigError(f"--format {file_format}: the firmware takes thrusts; remove --output")
     model = load_model(path)
     settings, source = agent_settings(path, model)
-    if file_format in FOLDERS:
+    if is_app:
         refuse_other_action(f"model {path}", model, "thrusts")
     if settings.action == "rates":
         if output != "thrusts":
@@ -101,17 +96,20 @@ def export_policy(
     if vehicle is None:
         vehicle = _own_vehicle(f"model {path}", settings, source)
     flown = first_vehicle(vehicle)
-    if file_format == "crazyflie":
+    if is_app:
         # Axes and rotors as the firmware has them.
         flown = flown.in_layout_of(load_vehicle("crazyflie"))
     trained = TrainedPolicy(model, settings, flown, output)
     network = build_network(trained, f"model {path}")
-    is_header = file_format in ("c", "crazyflie")
+    is_header = file_format != "onnx"
     facts: StrDict = {"cost": cost_of(network) if is_header else None}
-    facts["plan"] = plan_app(network) if file_format == "crazyflie" else {}
+    facts["plan"] = plan_app(network) if is_app else {}
     metadata = _describe(Path(path), network, **facts)
+    write: Any = partial(write_header, name=prefix)
+    read: Any = partial(load_header, name=prefix)
+    if not is_header:
+        write, read = write_onnx, load_onnx
     # The file is checked, then written again with the result of the check in it.
-    write, read = _writer_and_reader(file_format, prefix)
     call, by = read(write(network, metadata), network.state_size)
     error, n_compared = compare(trained, call, by, n_observations, relates=is_header)
     metadata["check"] = (
@@ -119,9 +117,9 @@ def export_policy(
     )
     content = write(network, metadata)
     files = None
-    if file_format in FOLDERS:
+    if is_app:
         words = {"name": prefix, "metadata": metadata, "vehicle": flown, **facts["plan"]}
-        files = _folder(file_format, content, words)
+        files = _app_files(content, words)
     return Export(content, metadata, error, network.unit, source, files)
 
 
@@ -144,18 +142,11 @@ def _own_vehicle(where: str, settings: FlightSettings, source: Path | None) -> V
     return vehicle
 
 
-def _writer_and_reader(file_format: str, prefix: str) -> tuple[Write, Read]:
-    """Return what writes files of a format, and what reads them for the check."""
-    if file_format == "onnx":
-        return write_onnx, load.load_onnx
-    return partial(write_header, name=prefix), partial(load.load_header, name=prefix)
-
-
-def _folder(file_format: str, content: bytes, words: StrDict) -> dict[str, bytes]:
-    """Return all files of a folder around a policy, by their paths in it."""
-    files = {FOLDERS[file_format]: content}
-    for file in FILES[file_format]:
-        template = f"{file_format}.{file.replace('/', '.')}.j2"
+def _app_files(content: bytes, words: StrDict) -> dict[str, bytes]:
+    """Return all files of an app around a policy, by their paths in its folder."""
+    files = {HEADER: content}
+    for file in FILES:
+        template = f"{APP}.{file.replace('/', '.')}.j2"
         files[file] = render("sb3_quad.export", template, content=content, **words).encode()
     return files
 

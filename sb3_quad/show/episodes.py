@@ -104,22 +104,19 @@ def outlook(recordings: Episode) -> FloatArray:
 class Setting(NamedTuple):
     """The episodes that all controllers fly."""
 
-    vehicle: Any  # the vehicle that experts are made for; in a scenario another one may fly
     settings: FlightSettings  # of all episodes
-    plan: Callable[[int], Plan]  # the events of an episode, by its seed
+    # The events of an episode, by its seed
+    plan: Callable[[int], Plan] = lambda seed: Plan()
     # Changes to the settings for a controller, by its label
     own: StrMapping = {}
 
 
-def fixed_setting(settings: FlightSettings) -> Setting:
-    """Episodes of some settings, each with a target of its own."""
-    return Setting(settings.vehicle, settings, lambda seed: Plan({}))
-
-
-def scenario_setting(text: str, own: Any = None, vehicle: str | None = None) -> Setting:
+def scenario_setting(
+    text: str, own: FlightSettings | None = None, vehicle: str | None = None
+) -> Setting:
     """Episodes of a scenario, named by ``suite:name``.
 
-    :param own: the vehicle of an agent, for a scenario that names none.
+    :param own: the settings of an agent, whose vehicle flies if the scenario names none.
     :param vehicle: a vehicle that flies instead of both.
     :raises ConfigError: an unknown suite or name.
     """
@@ -127,9 +124,7 @@ def scenario_setting(text: str, own: Any = None, vehicle: str | None = None) -> 
     if not colon:
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
     scenario = load_suite(suite).with_changes(vehicle=vehicle).scenario(name).flown_by(own)
-    return Setting(
-        scenario.nominal_vehicle(), scenario.settings, lambda seed: sample_plan(scenario, [seed])
-    )
+    return Setting(scenario.settings, lambda seed: sample_plan(scenario, [seed]))
 
 
 def fly_all(

@@ -107,16 +107,10 @@ def convert(value: Any, parameter: inspect.Parameter, where: str) -> Any:
     start = check(float, value.removeprefix(_LINEAR), f"{where}: the number after {_LINEAR}")
     check(parameter.annotation, start, where)
     schedule = LinearSchedule(start, 0.0, 1.0)
-    if not _takes(parameter.annotation, schedule):
-        raise ConfigError(f"{where} is {value!r}, but it takes no schedule")
-    return schedule
-
-
-def _takes(kind: Any, value: Any) -> bool:
     with suppress(ConfigError):
-        check(kind, value, "")
-        return True
-    return False
+        check(parameter.annotation, schedule, where)
+        return schedule
+    raise ConfigError(f"{where} is {value!r}, but it takes no schedule")
 
 
 def as_list(value: Any) -> Any:

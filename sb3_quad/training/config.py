@@ -25,8 +25,8 @@ from sb3_quad.agents.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.agents.zips import load_model
 from sb3_quad.algorithms.chain import chain_of
 from sb3_quad.algorithms.labelling import refuse_other_action
-from sb3_quad.base.errors import ConfigError, did_you_mean, refuse_unknown, unknown
-from sb3_quad.base.literals import parse_mapping, parse_number
+from sb3_quad.base.errors import ConfigError, did_you_mean, named, refuse_unknown, unknown
+from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.process import print_once
 from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.validate import Frozen, check, validate
@@ -44,7 +44,7 @@ from sb3_quad.training.algorithms import (
     qualified_classes,
     takes_expert,
 )
-from sb3_quad.training.options import JobOptions
+from sb3_quad.training.options import JobOptions, Number
 
 _FOLDERS = ("any_quadcopter", "nominal", "robust", "thesis")
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
@@ -52,11 +52,7 @@ SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_
 VecEnvKind = Literal["batch", "dummy", "subproc"]
 NORMALIZE = "stable_baselines3.common.vec_env.VecNormalize"
 
-Whole = Annotated[
-    int,
-    Field(lt=2**63),
-    BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name)),
-]
+Whole = Annotated[Number, Field(ge=1, lt=2**63)]
 Keywords = Annotated[
     StrDict, BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))
 ]
@@ -192,14 +188,14 @@ class TrainingConfig(Frozen):
             refuse_unknown("eval_tasks", self.eval_tasks, TASK_NAMES)
         elif self.eval_tasks:
             raise ConfigError(f"{self.env_id} has no tasks; remove eval_tasks")
-        if self.vec_env == "batch" and not self.task:
+        elif self.vec_env == "batch":
             raise ConfigError(
                 f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc"
             )
         return self
 
     @model_validator(mode="after")
-    def _policy_fits(self) -> "TrainingConfig":
+    def _algorithm_fits(self) -> "TrainingConfig":
         aliases = self.algorithm.policy_aliases
         refuse_unknown("policy", [self.policy], aliases)
         # The policy's constructor takes these, not the algorithm's.
@@ -208,12 +204,7 @@ class TrainingConfig(Frozen):
             f"keyword of {policy.__name__}", self.policy_kwargs, constructor_parameters(policy)
         )
         check(NetArch, self.policy_kwargs.get("net_arch"), "policy_kwargs: net_arch")
-        return self
-
-    @model_validator(mode="after")
-    def _algorithm_fits(self) -> "TrainingConfig":
-        if self.rollout_steps < 1:
-            raise ConfigError(f"n_steps is {self.rollout_steps}, must be at least 1")
+        check(PositiveInt, self.rollout_steps, "n_steps")
         if self.expert and not takes_expert(self.algorithm):
             raise ConfigError(f"expert: {self.algo} does not learn from an expert; remove expert")
         return self
@@ -302,9 +293,9 @@ def load_config(
     check_environment(env_id)
     # A user's file with the name of the default is not meant.
     content, where = SETTINGS.read(conf_file or SETTINGS.packaged(f"{algo}.yml"))
-    if env_id not in content:
-        missing = unknown("environment in this file", env_id, map(str, content))
-        raise ConfigError(f"{where}: {missing}; give another with --conf-file")
+    with named(where):
+        kind = "environment in this file"
+        refuse_unknown(kind, [env_id], content, "; give another with --conf-file")
     settings = content[env_id]
     if not isinstance(settings, dict):
         raise ConfigError(f"{where}: {env_id} must hold keys and values, such as 'n_envs: 8'")

@@ -91,22 +91,18 @@ class Stage(Frozen):
     agent: Any = Field(default=None, exclude=True, repr=False)
     """the loaded agent that a single run starts from"""
 
-    def load(self) -> TrainingConfig:
-        """Return the checked settings of the stage.
+    def job(self, options: StrMapping) -> TrainingJob:
+        """Return the checked job of the stage.
 
-        :raises ConfigError: see :func:`~sb3_quad.training.config.load_config`.
+        :param options: those of :class:`~sb3_quad.training.options.JobOptions`; the evaluations of
+            the stage may differ from those of its pipeline.
+        :raises ConfigError: settings or options that do not fit.
         """
         # A settings file takes precedence over the agent's settings.
         like = None if self.conf_file else self.agent
-        return load_config(self.algo, self.env, self.conf_file, self.settings, like)
-
-    def job(self, options: StrMapping) -> TrainingJob:
-        """Return the checked job of the stage as a single run.
-
-        :param options: those of :class:`~sb3_quad.training.options.JobOptions`.
-        :raises ConfigError: settings or options that do not fit.
-        """
-        fields = {**options, "config": self.load(), "agent": self.agent}
+        config = load_config(self.algo, self.env, self.conf_file, self.settings, like)
+        own = self.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
+        fields = {**own, **options, "config": config, "agent": self.agent}
         return validate(TrainingJob, fields, "command line")
 
 
@@ -144,7 +140,6 @@ class StageResult(NamedTuple):
 
     run: str
     agent: str
-    timesteps: int
     seconds: float
 
 
@@ -165,11 +160,6 @@ class PipelineResult(NamedTuple):
     agent: str = ""
     problem: str = ""
     exit_code: int = 0
-
-
-def is_pipeline_run(folder: Path) -> bool:
-    """Whether a folder is a pipeline's rather than a single run's."""
-    return (folder / STATUS_FILE).is_file()
 
 
 def load_pipeline(conf_file: StrPath, changes: StrMapping | None = None) -> Pipeline:
@@ -250,7 +240,8 @@ def run_pipeline(
     status = Status(stages=stages, job=dict(job), runs=[])
     content = status.model_dump(mode="json", exclude_defaults=True)
     write_yaml(folder / STATUS_FILE, content)
-    return resume_pipeline(folder, report, log_folder=jobs[0].log_folder)
+    own = jobs[0].model_dump(include={"log_folder", "tensorboard_log"})
+    return resume_pipeline(folder, report, **own)
 
 
 def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
@@ -260,17 +251,13 @@ def stage_jobs(pipeline: Pipeline, job: StrMapping) -> list[TrainingJob]:
     """
     jobs: list[TrainingJob] = []
     for stage in pipeline.stages:
-        where = f"stage {stage.name!r}"
-        with named(where):
-            config = stage.load()
-            _check_correction(stage, config)
-            if jobs and bool(config.normalize) != bool(jobs[-1].config.normalize):
+        with named(f"stage {stage.name!r}"):
+            made = stage.job(job)
+            _check_correction(stage, made.config)
+            if jobs and bool(made.config.normalize) != bool(jobs[-1].config.normalize):
                 raise ConfigError("normalize: must be as in the stage before, whose agent it has")
-        # The evaluations of a stage may differ from those of the pipeline.
-        own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
-        made = validate(TrainingJob, {**own, **job, "config": config}, where)
-        if stage.require and "require" in stage.model_fields_set and made.eval_episodes == 0:
-            raise ConfigError(f"{where}: require: needs evaluations; give --eval-episodes")
+            if stage.require and "require" in stage.model_fields_set and made.eval_episodes == 0:
+                raise ConfigError("require: needs evaluations; give --eval-episodes")
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
     return jobs
 
@@ -302,11 +289,9 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
         settings = str(folder / str(stage.conf_file))
         stages.append(stage.model_copy(update={"conf_file": settings}))
     options = {**status.job, "log_folder": str(log_folder), **changes}
-    if not changes.get("tensorboard_log"):
-        refuse_outside(options.get("tensorboard_log") or ".", where, log_folder, Path())
     jobs = stage_jobs(Pipeline(stages=stages), options)
     for job in jobs:
-        refuse_elsewhere(job.config, where, log_folder)
+        refuse_elsewhere(job, where, log_folder, changes)
     runs = []
     for name in status.runs:
         refuse_outside(log_folder / name, f"{where}: runs", log_folder)
@@ -360,9 +345,7 @@ def resume_pipeline(folder: Path, report: Report = print, **changes: Any) -> Pip
                         agent = Path(str(best.job.initial_policy))
                         problem = f"{best.label} flies this vehicle better"
                         handed = HandOver(agent, {}, problem=problem)
-                results[stage.name] = StageResult(
-                    str(run.path), str(handed.agent), run.timesteps, seconds
-                )
+                results[stage.name] = StageResult(str(run.path), str(handed.agent), seconds)
         except KeyboardInterrupt:
             if not signals.received:
                 raise

@@ -14,9 +14,9 @@ from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import make_folder, read_arrays, refuse_outside, write_text
 from sb3_quad.base.process import trusted
-from sb3_quad.base.types import StrDict, StrPath
+from sb3_quad.base.types import StrDict, StrMapping, StrPath
 from sb3_quad.base.yaml_files import read_yaml, write_yaml
-from sb3_quad.training.config import TrainingConfig
+from sb3_quad.training.config import TrainingJob
 
 MADE_WITH = ("commit", "versions")  # keys of args.yml
 
@@ -193,12 +193,17 @@ def open_run(path: StrPath) -> RunFolder:
     return RunFolder(folder, configs[0].parent.name)
 
 
-def refuse_elsewhere(config: TrainingConfig, where: str, log_folder: Path) -> None:
-    """Refuse callbacks and wrappers of a run, which may be a stranger's, that may write elsewhere.
+def refuse_elsewhere(job: TrainingJob, where: str, log_folder: Path, given: StrMapping) -> None:
+    """Refuse what may write elsewhere in a run, which may be a stranger's: callbacks, wrappers, and
+    a folder for TensorBoard.
 
     :param where: what the message calls the run's settings.
-    :raises ConfigError: one of their keywords is a path out of the log folder and the current one.
+    :param given: options that the user gives instead of the run's.
+    :raises ConfigError: it has a path out of the log folder and the current one.
     """
+    if job.tensorboard_log and not given.get("tensorboard_log"):
+        refuse_outside(job.tensorboard_log, where, log_folder, Path())
+    config = job.config
     for name, keywords in (*config.callback, *config.env_wrapper, *config.vec_env_wrapper):
         for value in keywords.values():
             if isinstance(value, str) and not trusted():

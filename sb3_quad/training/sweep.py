@@ -276,6 +276,6 @@ def train_run(
     spec = ControllerSpec("agent", last.agent)
     flights = {}
     for scenario in suite.scenarios:
-        flown = scenario.flown_by(spec.own and spec.own.vehicle)
+        flown = scenario.flown_by(spec.own)
         flights[scenario.name] = numbers(fly_scenario(model, flown, own=spec.observed))
     return {"flights": flights}

@@ -14,7 +14,6 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch as th
@@ -32,7 +31,6 @@ from sb3_quad.base.files import (
     make_folder,
     one_line,
     refuse_links,
-    refuse_outside,
     save_model,
     write_bytes,
     write_text,
@@ -128,9 +126,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         options.pop(name, None)
     job = validate(TrainingJob, {**options, **changes, "config": config}, str(run.arguments))
     log_folder = run.path.absolute().parent.parent
-    refuse_elsewhere(config, str(run.config), log_folder)
-    if job.tensorboard_log and not changes.get("tensorboard_log"):
-        refuse_outside(job.tensorboard_log, str(run.arguments), log_folder, Path())
+    refuse_elsewhere(job, str(run.config.parent), log_folder, changes)
     with (
         StopSignals() as signals,
         locked(run.path, "run folder"),
@@ -281,8 +277,7 @@ class _Training:
             )
             self.callbacks.append(self.best)
         if job.save_freq > 0:
-            checkpoint = run.path / "rl_model_{steps}_steps.zip"
-            self.callbacks.append(Checkpoint(job.save_freq, str(checkpoint)))
+            self.callbacks.append(Checkpoint(job.save_freq, str(run.checkpoint("{steps}"))))
         self.callbacks += self.user_callbacks
         self.callbacks.append(ProgressBarCallback() if job.progress else ProgressLine(self.report))
 

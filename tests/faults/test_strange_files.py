@@ -24,7 +24,7 @@ from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.evaluation.evaluate import _flown_before
 from sb3_quad.evaluation.results import load_results
 from sb3_quad.evaluation.scenarios.load import load_suite
-from sb3_quad.training.config import SETTINGS, build_config
+from sb3_quad.training.config import SETTINGS, TrainingJob, build_config
 from sb3_quad.training.runs import refuse_elsewhere
 
 READERS = {
@@ -160,7 +160,7 @@ def test_a_run_that_is_resumed_names_no_place_elsewhere(key, name, keyword, monk
     def check(path):
         settings = {"n_timesteps": 10, "vec_env": "dummy", key: {name: {keyword: path}}}
         config = build_config("ppo", "QuadTargetTracking-v0", settings)
-        refuse_elsewhere(config, "config.yml", Path("logs"))
+        refuse_elsewhere(TrainingJob(config=config), "config.yml", Path("logs"), {})
 
     check("logs/here")
     with pytest.raises(ConfigError, match=r"config\.yml: .*/etc/there is outside of"):

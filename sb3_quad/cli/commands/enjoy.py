@@ -33,7 +33,7 @@ from typing import Any
 
 from pydantic import NonNegativeInt, PositiveFloat, PositiveInt
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.files import refuse_existing
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
@@ -156,10 +156,7 @@ def _check(options: Namespace, window: bool) -> None:
     for name in given(options, "vehicle", "task").keys() & options.env_kwargs.keys():
         raise ConfigError(f"{name}: given by --{name} and by --env-kwargs; remove one of them")
     env_id = options.env or DEFAULT_ENV
-    if env_id not in ENVIRONMENTS:
-        raise ConfigError(
-            f"{unknown('environment', env_id, ENVIRONMENTS)}; rl_zoo3.enjoy shows others"
-        )
+    refuse_unknown("environment", [env_id], ENVIRONMENTS, "; rl_zoo3.enjoy shows others")
     if options.size:
         check_size(*options.size)
     if options.output:
@@ -178,7 +175,7 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     from sb3_quad.cli.output import warn
     from sb3_quad.envs.vehicles.vehicle import first_vehicle
     from sb3_quad.evaluation.controllers import ControllerSpec, parse_controllers
-    from sb3_quad.show.episodes import fixed_setting, scenario_setting
+    from sb3_quad.show.episodes import Setting, scenario_setting
 
     specs = parse_controllers(options.controllers)
     if options.algo:
@@ -187,15 +184,15 @@ def _setting(options: Namespace) -> tuple[Any, StrDict]:
     # The settings of the first agent hold for all.
     first = next(filter(None, (spec.own for spec in specs)), None)
     if options.scenario is None:
-        setting = fixed_setting(_flight_settings(options, first))
+        setting = Setting(_flight_settings(options, first))
     elif options.env_kwargs:
         raise ConfigError("--scenario describes a whole flight; remove --env-kwargs")
     else:
-        setting = scenario_setting(options.scenario, first and first.vehicle, options.vehicle)
+        setting = scenario_setting(options.scenario, first, options.vehicle)
     controllers = {}
     # What an agent observes stays as in its training, unless the command line says otherwise.
     observed = {}
-    vehicle = first_vehicle(setting.vehicle, options.env_kwargs.get("rotor_layout"))
+    vehicle = first_vehicle(setting.settings.vehicle, options.env_kwargs.get("rotor_layout"))
     for spec in specs:
         warn(spec.notice(vehicle))
         action = options.env_kwargs.get("action", "thrusts")

@@ -25,20 +25,15 @@ of a C header needs a C compiler.
 from argparse import Namespace
 from pathlib import Path
 
+from sb3_quad.agents.pretrained import agent_path
 from sb3_quad.base.errors import ConfigError, refuse_unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.cli.parser import (
-    OVERWRITE,
-    TRUST,
-    Flags,
-    agent,
-)
+from sb3_quad.cli.parser import OVERWRITE, TRUST, Flags
 
 FLAGS: Flags = {
     "model MODEL": (
-        agent,
         "agent with an MlpPolicy (of PPO, A2C, DAgger, PPOBC, APG, SAC or TD3): "
-        "a zip, a run folder, hf:ORG/NAME, or a name such as itm-recovery",
+        "a zip, a run folder, hf:ORG/NAME, or a name such as itm-recovery"
     ),
     "--format": ({"required": True}, "onnx, c or crazyflie"),
     "-o FILE": (
@@ -63,11 +58,11 @@ def run(options: Namespace) -> int:
     from sb3_quad.cli.output import warn
     from sb3_quad.evaluation.controllers import ControllerSpec
     from sb3_quad.export.c_header import c_name
-    from sb3_quad.export.policy import FOLDERS, FORMATS, export_policy
+    from sb3_quad.export.policy import APP, FORMATS, HEADER, export_policy
 
     refuse_unknown("format", [options.format], FORMATS)
-    model = Path(options.model)
-    is_app = options.format in FOLDERS
+    model = Path(agent_path(options.model))
+    is_app = options.format == APP
     ending = FORMATS[options.format]
     file = Path(options.file or "")
     # Without a suffix it is a folder; without -o, this one. An app is a folder itself.
@@ -78,11 +73,11 @@ def run(options: Namespace) -> int:
     # Suffixes that no format has, such as .hpp, are the user's choice.
     if file.suffix != ending and file.suffix in (*FORMATS.values(), ".zip"):
         raise ConfigError(f"{file}: --format {options.format} writes {model.stem}{ending}")
-    refuse_existing(file / FOLDERS.get(options.format, ""), options.overwrite)
+    refuse_existing(file / HEADER if is_app else file, options.overwrite)
     name = options.name
     if name is None:
         name = c_name(model.stem if is_app else file.stem)
-    elif options.format not in ("c", "crazyflie"):
+    elif options.format == "onnx":
         raise ConfigError(f"--name {name}: only a C header has one (--format c)")
     if options.vehicle:
         warn(ControllerSpec(model.stem, str(model)).notice(options.vehicle))

@@ -38,6 +38,7 @@ from typing import Any
 
 from pydantic import PositiveInt
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import StrDict
 from sb3_quad.cli.parser import (
     PAIRS,
@@ -48,7 +49,6 @@ from sb3_quad.cli.parser import (
     Flags,
     field_flags,
     given,
-    refuse_with_resume,
     seed,
 )
 from sb3_quad.training.options import (
@@ -122,7 +122,9 @@ def run(options: Namespace) -> int:
     job = given(options, *JobOptions.model_fields)
     job["progress"] = shows_progress(options.progress)
     if options.resume is not None:
-        refuse_with_resume(options, *KEPT_BY_RESUME)
+        for name in given(options, *KEPT_BY_RESUME):
+            flag = name.replace("_", "-")
+            raise ConfigError(f"--resume keeps the settings of what it resumes; remove --{flag}")
     prepare(options)
     result = _begin(options, job) if options.resume is None else _resume(options.resume, job)
     if isinstance(result, TrainingResult):
@@ -132,10 +134,10 @@ def run(options: Namespace) -> int:
 
 def _resume(folder: str, job: StrDict) -> Any:
     """Continue a run or a pipeline, and return its result."""
-    from sb3_quad.training.pipeline import is_pipeline_run, resume_pipeline
+    from sb3_quad.training.pipeline import STATUS_FILE, resume_pipeline
     from sb3_quad.training.trainer import resume
 
-    if is_pipeline_run(Path(folder)):
+    if Path(folder, STATUS_FILE).is_file():
         return resume_pipeline(Path(folder), **job)
     return resume(folder, **job)
 
@@ -163,11 +165,12 @@ def prepare(options: Namespace) -> None:
     """
     import torch
 
-    from sb3_quad.base.imports import import_packages
+    from sb3_quad.base.imports import import_name
     from sb3_quad.fast.perceptron import use_one_torch_thread
 
     # Environments must be registered before the settings are checked.
-    import_packages(options.gym_packages, "--gym-packages")
+    for module in options.gym_packages:
+        import_name(module, "--gym-packages")
     if options.num_threads is None:
         use_one_torch_thread()
     else:

@@ -2,15 +2,13 @@
 and torques that act on them. Units are SI, angles in degrees where noted.
 """
 
-import math
 from typing import Literal
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from sb3_quad.base.validate import Frozen
+from sb3_quad.envs.batch_env import Quaternion, Vector
 
-Vector = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 Frame = Literal["world", "body"]
 
 
@@ -36,13 +34,6 @@ class Start(Frozen):
     """world or body: the axes of velocity"""
     body_rates: Vector | RandomDirection | None = None
     """body frame, rad/s: [x, y, z] or {magnitude: …}"""
-
-    @field_validator("quaternion")
-    @classmethod
-    def _not_zero(cls, value: Quaternion | None) -> Quaternion | None:
-        if value is not None and math.hypot(*value) < 1e-6:
-            raise ValueError("must not be zero")
-        return value
 
     @model_validator(mode="after")
     def _turnable(self) -> "Start":

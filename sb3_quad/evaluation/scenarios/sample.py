@@ -7,8 +7,9 @@ import numpy as np
 
 from sb3_quad.base.seeds import SCENARIO_STREAM
 from sb3_quad.base.types import FloatArray
+from sb3_quad.envs.batch_env import Vector
 from sb3_quad.envs.simulation.state import WRENCH_SIZE, make_wrench, rotation_matrices
-from sb3_quad.evaluation.scenarios.events import RandomDirection, Start, Vector
+from sb3_quad.evaluation.scenarios.events import RandomDirection, Start
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
 Generators = Sequence[np.random.Generator]  # one for each episode

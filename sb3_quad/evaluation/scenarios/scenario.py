@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import AfterValidator, Field, PositiveFloat, field_validator, model_validator
@@ -10,7 +10,8 @@ from pydantic import AfterValidator, Field, PositiveFloat, field_validator, mode
 from sb3_quad.base.errors import refuse_unknown
 from sb3_quad.base.seeds import Seed, row_seeds, seed_for
 from sb3_quad.base.types import StrDict
-from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.validate import Frozen, Share, validate
+from sb3_quad.envs.batch_env import Vector
 from sb3_quad.envs.simulation.randomization import Randomization
 from sb3_quad.envs.simulation.recordings import Recording
 from sb3_quad.envs.simulation.references import Reference
@@ -18,7 +19,7 @@ from sb3_quad.envs.simulation.settings import Action, FlightSettings, Noise
 from sb3_quad.envs.simulation.tasks import T, Task, resolve_tasks
 from sb3_quad.envs.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.envs.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
-from sb3_quad.evaluation.scenarios.events import Start, Vector, Wrench
+from sb3_quad.evaluation.scenarios.events import Start, Wrench
 
 # m: the tolerances of Figs. 4.6 and 4.7, and a tighter one
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
@@ -77,7 +78,7 @@ class Scenario(Frozen):
     """name, or path of a YAML file (relative to the suite's); default: the agent's own, or itm"""
     action: Action = "thrusts"
     """what the actions of experts command; an agent's are those of its training"""
-    noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
+    noise: Noise | Share = 0.05
     """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …,
     estimator: {position: …, …}}; with an estimator, experts see its estimate
     """
@@ -194,16 +195,16 @@ class Scenario(Frozen):
             return self.vehicle
         return _by_name(self.vehicle or DEFAULT_VEHICLE)
 
-    def flown_by(self, own: Any) -> "Scenario":
+    def flown_by(self, own: FlightSettings | None) -> "Scenario":
         """Return the scenario with an agent's vehicle, unless it names one itself.
 
-        :param own: the agent's vehicle, or several; None: it has none.
+        :param own: the agent's settings; None: it has none.
 
         :raises ConfigError: it is impossible for that vehicle.
         """
         if own is None or self.vehicle is not None:
             return self
-        return self.changed({"vehicle": first_vehicle(own)})
+        return self.changed({"vehicle": first_vehicle(own.vehicle)})
 
     def changed(self, changes: StrDict) -> "Scenario":
         """Return the scenario with other values of some keys.
@@ -235,19 +236,9 @@ class Scenario(Frozen):
     @property
     def settings(self) -> FlightSettings:
         """The settings of the episodes."""
-        return FlightSettings().with_changes(
-            task=self.task,
-            task_kwargs=self.task_kwargs,
-            vehicle=self.nominal_vehicle(),
-            action=self.action,
-            noise=self.noise,
-            vehicles=self.vehicles,
-            randomize=self.randomize,
-            reference=self.reference,
-            wrench=self.wrench,
-            wind=self.wind,
-            max_episode_steps=self.steps,
-        )
+        given = {name: value for name, value in self if name in FlightSettings.model_fields}
+        given |= {"vehicle": self.nominal_vehicle(), "max_episode_steps": self.steps}
+        return FlightSettings().with_changes(**given)
 
     @property
     def targets(self) -> tuple[Vector, ...]:

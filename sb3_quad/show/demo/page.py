@@ -9,7 +9,7 @@ import base64
 import json
 import re
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 
 import numpy as np
@@ -39,32 +39,32 @@ DEFAULT_AGENTS = (
 )
 EXACT = 50_000  # networks with more numbers than this are rounded to half precision
 # The modules of the page in the order of their imports: those that need no browser, and the others.
-MODEL = [
-    "tables",
-    "vehicle",
-    "dynamics",
-    "rates",
-    "observation",
-    "network",
-    "experts",
-    "course",
-    "flight",
-    "weights",
-    "gradient",
-]
-VIEW = [
-    "fleet",
-    "camera",
-    "airframe",
-    "scene",
-    "plots",
-    "hand",
-    "player",
-    "board",
-    "controls",
-    "school",
-    "app",
-]
+MODEL = """
+    tables
+    vehicle
+    dynamics
+    rates
+    observation
+    network
+    experts
+    course
+    flight
+    weights
+    gradient
+    """
+VIEW = """
+    fleet
+    camera
+    airframe
+    scene
+    plots
+    hand
+    player
+    board
+    controls
+    school
+    app
+    """
 EXPERTS = ("pid", "geometric")
 FEATURES = {"position", "rotation", "velocity", "body_rates"}  # as observation.js computes them
 TABLES = {
@@ -196,11 +196,10 @@ def pack(network: Network) -> StrDict:
     }
 
 
-def script(modules: Iterable[str]) -> str:
+def script(modules: str) -> str:
     """Return the named modules as one script, in this order."""
-    text = "\n".join(
-        files(__package__).joinpath(f"{name}.js").read_text("utf-8") for name in modules
-    )
+    folder = files(__package__)
+    text = "\n".join(folder.joinpath(f"{name}.js").read_text("utf-8") for name in modules.split())
     return join_modules(text).replace('JSON.parse("TABLES")', json.dumps(TABLES))
 
 
