@@ -13,18 +13,18 @@ import numpy as np
 import pandas as pd
 
 from sb3_quad.base.errors import ConfigError, raised_as
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.envs.vehicles.vehicle import MAX_PHYSICS_STEP, Vehicle
 from sb3_quad.identification.curve import Curve, refuse_other_order, regress
 from sb3_quad.identification.flight_log import Log
 from sb3_quad.identification.intervals import jackknife, not_told
 from sb3_quad.identification.open_loop import log_thrusts
 from sb3_quad.identification.parameters import FASTEST, Guess
-from sb3_quad.identification.prediction_error import Model
+from sb3_quad.identification.prediction_error import Model, Optimum
 
 Show = Callable[[int, int, str], object]
 # Short and long horizons of logs with velocity, and of body rates alone, s
-HORIZONS = np.array([0.02, 0.05, 0.1]), np.array([0.05, 0.1, 0.2, 0.3, 0.5])
+HORIZONS = np.array([0.02, 0.05, 0.1]), np.linspace(0.05, 0.5, 10)
 HORIZONS_OF_RATES = np.arange(0.02, 0.11, 0.02), np.arange(0.02, 0.21, 0.02)
 # Lags and delays that the regression tries, s
 LAGS = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.06, 0.08, 0.11, 0.15])
@@ -64,40 +64,47 @@ def fit_vehicle(
     report(1, 3, "predictions")
     short, long = HORIZONS if logs[0].has_motion else HORIZONS_OF_RATES
     model = Model(logs, guess, short)
-    free = model.free()
-    optimum = model.solve(model.vector_of(guess), free, 10)
+    optimum = model.solve(model.vector_of(guess), 10)
     # Sizes are those of the fit so far, since damping grows with the inertia.
     guess = model.guess(optimum.vector)
     model = Model(logs, guess, long)
     vector = model.vector_of(guess)
     model.weigh(vector)
-    optimum = model.solve(vector, free, 6)
+    optimum = model.solve(vector, 6)
     report(2, 3, "what the logs tell")
-    vector = optimum.vector
     before = guess._replace(vehicle=start)
     known = model.vector_of(before)
-    table = model.table
-    for place, reason in not_told(model, optimum, free).items():
-        vector[place] = known[place]
-        table.loc[place, "reason"] = reason
+    while held := not_told(model, optimum):
+        vector = optimum.vector
+        for place, reason in held.items():
+            vector[place] = known[place]
+            model.table.loc[place, "reason"] = reason
+        model.weigh(vector)
+        optimum = model.solve(vector, 4)
     free = model.free()
-    model.weigh(vector)
-    optimum = model.solve(vector, free, 4)
     known[free] = optimum.vector[free]
+    table = _with_intervals(model, optimum, known * model.scale)
     table["start"] = before.vector()
-    table["value"] = known * model.scale
-    table["width"] = np.nan
-    table.loc[free, "width"] = jackknife(optimum.slopes, optimum.errors) * model.scale[free]
-    delay = len(guess.curve.coefficients)
-    least = LEAST_WIDTH * np.maximum(table["value"].abs(), table["size"])
-    least[delay] = LEAST_DELAY_WIDTH
-    table["width"] = table["width"].clip(least)
     report(3, 3, "done")
     with raised_as(ConfigError, f"{logs[0].path}: the fit is no vehicle that can fly"):
-        fitted = before.moved(known * model.scale)
+        fitted = before.moved(table["value"].to_numpy())
     steps = round(fitted.delay / start.control_step)
-    has_lag = table["reason"][delay + 1] == ""
+    has_lag = table.set_index("field")["reason"]["motor_gain_up"] == ""
     return Fit(_with_limits(fitted, name, steps, has_lag), fitted.curve, table)
+
+
+def _with_intervals(model: Model, optimum: Optimum, values: FloatArray) -> pd.DataFrame:
+    """Return the table of a model with values and the widths of those that are fitted."""
+    free = model.free()
+    widths = jackknife(optimum.slopes, optimum.errors)
+    table = model.table
+    least = LEAST_WIDTH * np.maximum(np.abs(values), table["size"])
+    least = least.where(table["field"] != "delay", LEAST_DELAY_WIDTH)
+    table["value"] = values
+    table["width"] = np.nan
+    table.loc[free, "width"] = widths * model.scale[free]
+    table["width"] = table["width"].clip(least)
+    return table
 
 
 def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
@@ -106,14 +113,15 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
     :raises ConfigError: motors turn the vehicle otherwise than its file says.
     """
     kind = logs[0].kind
-    gains = np.array([FASTEST]) if kind == "rotor_speed" else 1.0 / LAGS
+    gains = 1.0 / LAGS
+    if kind == "rotor_speed":
+        gains = np.array([FASTEST])
     pairs = [*product(gains.tolist(), DELAYS.tolist())]
     curves = [regress(logs, start, *pair) for pair in pairs]
     best = int(np.argmin([rest for _, rest in curves]))
     curve, _ = curves[best]
     gain, delay = pairs[best]
-    for log in logs:
-        refuse_other_order(log, start, log_thrusts([log], start, curve, delay))
+    refuse_other_order(logs, start, log_thrusts(logs, start, curve, delay))
     strongest = max(curve.thrust(log.mean_commands()).max() for log in logs)
     step = logs[0].step
     changes: StrDict = {
