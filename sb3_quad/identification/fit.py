@@ -30,6 +30,9 @@ HORIZONS_OF_RATES = np.arange(0.02, 0.11, 0.02), np.arange(0.02, 0.21, 0.02)
 LAGS = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.06, 0.08, 0.11, 0.15])
 DELAYS = np.arange(0.0, 0.035, 0.005)
 MOST_THRUST = 30.0  # of a motor at full command, by what it needs to hover
+# Radii of gyration by the rotors' distance from the centre: 0.3 to 0.7 is usual
+LEAST_GYRATION = 0.2
+MOST_GYRATION = 2.0
 # No interval is narrower than this part of its value or size, or this many seconds of a delay:
 # simulated logs with noise show such errors beyond the jackknife's intervals.
 LEAST_WIDTH = 0.03
@@ -70,7 +73,7 @@ def fit_vehicle(
     model = Model(logs, guess, long)
     vector = model.vector_of(guess)
     model.weigh(vector)
-    optimum = model.solve(vector, 6)
+    optimum = model.solve(vector, 12)
     report(2, 3, "what the logs tell")
     before = guess._replace(vehicle=start)
     known = model.vector_of(before)
@@ -80,7 +83,7 @@ def fit_vehicle(
             vector[place] = known[place]
             model.table.loc[place, "reason"] = reason
         model.weigh(vector)
-        optimum = model.solve(vector, 4)
+        optimum = model.solve(vector, 6)
     free = model.free()
     known[free] = optimum.vector[free]
     table = _with_intervals(model, optimum, known * model.scale)
@@ -88,6 +91,13 @@ def fit_vehicle(
     report(3, 3, "done")
     with raised_as(ConfigError, f"{logs[0].path}: the fit is no vehicle that can fly"):
         fitted = before.moved(table["value"].to_numpy())
+    ratios = fitted.vehicle.gyration_ratios
+    if ratios.min() < LEAST_GYRATION or ratios.max() > MOST_GYRATION:
+        raise ConfigError(
+            f"{logs[0].path}: the moments of inertia would have radii of {ratios.min():.2g} to "
+            f"{ratios.max():.2g} of the rotors' distance; are the gyro's unit, the mass and the "
+            "rotors' positions right?"
+        )
     steps = round(fitted.delay / start.control_step)
     has_lag = table.set_index("field")["reason"]["motor_gain_up"] == ""
     return Fit(_with_limits(fitted, name, steps, has_lag), fitted.curve, table)
@@ -153,12 +163,10 @@ def _with_limits(fitted: Guess, name: str, delay: int, has_lag: bool) -> Vehicle
     if has_lag:
         lag = 1.0 / vehicle.motor_gain_up + fitted.delay - delay * vehicle.control_step
         changes["motor_gain"] = 1.0 / max(lag, 1.0 / FASTEST)
-    limits = {
-        "thrust": vehicle.thrust_range,
-        "share": (0.0, 1.0),
-        "rotor_speed": vehicle.rotor_speed_range,
-    }
-    low, high = fitted.curve.thrust(np.array(limits[fitted.curve.kind]))
+    low, most = vehicle.thrust_range
+    _, fastest = vehicle.rotor_speed_range
+    full = {"thrust": most, "share": 1.0, "rotor_speed": fastest}
+    high = fitted.curve.thrust(np.array(full[fitted.curve.kind]))
     if not 1.05 < high / vehicle.hover_thrust < MOST_THRUST:
         raise ConfigError(
             f"the motors would push with {high:.3g} N at full command, and {vehicle.name} needs "
@@ -167,5 +175,6 @@ def _with_limits(fitted: Guess, name: str, delay: int, has_lag: bool) -> Vehicle
         )
     if fitted.curve.kind == "rotor_speed":
         changes["thrust_coefficient"] = float(fitted.curve.coefficients[0])
-    changes["rotor_thrust_limits"] = max(low, 0.01 * vehicle.hover_thrust), high
+    # No flight tells what a motor that gets hardly anything does.
+    changes["rotor_thrust_limits"] = low, float(high)
     return vehicle.model_copy(update=changes)

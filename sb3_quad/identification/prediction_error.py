@@ -16,7 +16,9 @@ from sb3_quad.identification.open_loop import Windows, gaps, log_thrusts
 from sb3_quad.identification.parameters import Guess, parameters_of
 from sb3_quad.identification.smoothing import smoothed
 
-MOST_WINDOWS = 375
+# Windows overlap; nearer ones, s, hardly tell more.
+APART = 0.16
+MOST_WINDOWS = 750
 # Of position, velocity, attitude, body rates and specific force, in the units of the motion: errors
 # of this size count as one in the first fit.
 ERRORS = (0.1, 0.4, 0.15, 0.4, 2.0)
@@ -54,7 +56,7 @@ class Model:
         stride = ends[-1]
         if self.has_motion:
             flying = sum(log.flying.sum() for log in logs)
-            stride = max(1, flying // MOST_WINDOWS)
+            stride = max(round(APART / step), flying // MOST_WINDOWS)
         self.windows = Windows(logs, start.vehicle, ends, stride)
         if self.has_motion:
             # The noise of where a window begins would grow with some parameters, and bias them.
