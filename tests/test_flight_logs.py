@@ -308,6 +308,17 @@ def test_the_fit_gives_back_what_flew(tmp_path):
     np.testing.assert_allclose(fit.curve.thrust(commands), expected, rtol=0.05)
     held = {one.field: one.reason for one in fit.estimates.itertuples() if one.reason}
     assert "no velocity" in held["drag"]
+    # What a motor does at its least command, no flight tells.
+    assert fit.vehicle.thrust_range[0] == pytest.approx(start.thrust_range[0])
+
+
+@pytest.mark.slow
+def test_a_gyro_in_another_unit_is_refused_by_the_inertia(table, tmp_path):
+    other = table.copy()
+    other[GYRO_COLUMNS] /= 9.81
+    write_plain(tmp_path / "log", other)
+    with pytest.raises(ConfigError, match="gyro's unit"):
+        fit_vehicle(read_logs(tmp_path / "log"), load_vehicle("crazyflie"))
 
 
 @pytest.mark.slow

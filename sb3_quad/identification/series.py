@@ -20,7 +20,7 @@ def cleaned(name: str, table: FloatArray, largest: float, notes: list[str]) -> F
     """
     time, *columns = np.abs(table).T
     known = np.isfinite(time) & (np.max(columns, axis=0) <= largest)
-    rows = table[known]
+    rows: FloatArray = table[known]
     missing = len(table) - len(rows)
     unknown = f"no number up to {largest:g}"
     if len(rows) < max(2, missing):
