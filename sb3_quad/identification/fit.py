@@ -30,7 +30,7 @@ HORIZONS_OF_RATES = np.arange(0.02, 0.11, 0.02), np.arange(0.02, 0.21, 0.02)
 LAGS = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.06, 0.08, 0.11, 0.15])
 DELAYS = np.arange(0.0, 0.035, 0.005)
 MOST_THRUST = 30.0  # of a motor at full command, by what it needs to hover
-# Radii of gyration by the rotors' distance from the centre: 0.3 to 0.7 is usual
+# Radii of gyration by the rotors' distance from the centre, beyond which a unit is wrong
 LEAST_GYRATION = 0.2
 MOST_GYRATION = 2.0
 # No interval is narrower than this part of its value or size, or this many seconds of a delay:

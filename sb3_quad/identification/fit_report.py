@@ -80,9 +80,7 @@ def prediction_plot(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> Figu
     shown = windows.rows < first + round(SHOWN / step)
     rows = windows.rows[shown] + np.arange(count + 1)[:, None]
     recorded = np.arange(first, rows.max())
-    panels = PANELS
-    if not log.has_motion:
-        panels = PANELS[:1]
+    panels = PANELS if log.has_motion else PANELS[:1]
     figure = Figure(figsize=(3 * WIDTH, HEIGHT * len(panels)), layout="constrained")
     all_axes = figure.subplots(len(panels), 3, squeeze=False, sharex=True)
     for line, (name, unit, part) in zip(all_axes, panels, strict=True):

@@ -63,9 +63,7 @@ class Model:
             motion = np.concatenate([smoothed(log) for log in logs])
             self.windows.start = motion[self.windows.rows]
         self.force = np.concatenate([log.force for log in logs])
-        self.usual = ERRORS
-        if not self.has_motion:
-            self.usual = ERRORS[RATES:]
+        self.usual = ERRORS if self.has_motion else ERRORS[RATES:]
         self.sizes = [np.array(size) for size in self.usual]
 
     def vector_of(self, guess: Guess) -> FloatArray:
@@ -111,7 +109,7 @@ class Model:
             flat = (part / size).reshape(len(part), -1)
             scaled.append(flat)
         # Predictions that diverge must not become infinite.
-        return np.clip(np.hstack(scaled), -1e3, 1e3)
+        return np.asarray(np.clip(np.hstack(scaled), -1e3, 1e3))
 
     def weigh(self, vector: FloatArray) -> None:
         """Count errors by the size that they have now, each column after each horizon."""
