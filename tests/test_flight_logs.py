@@ -157,7 +157,7 @@ def test_check_vehicle_prints_the_errors(folder, capsys):
     ("change", "named"),
     [
         (lambda table: table.drop(columns=["qw"]), "accelerometer"),
-        (lambda table: table.assign(qw="a"), "attitude: 0 of"),
+        (lambda table: table.assign(qw="a"), "attitude: 200 of 200 rows"),
         (lambda table: table[:1], "bad.csv"),
         (lambda table: table.assign(t=table["t"].where(table.index != 8, 0.01)), "runs back"),
         (lambda table: table.assign(pz=0.0), "0.3 m"),
@@ -173,7 +173,7 @@ def test_check_vehicle_prints_the_errors(folder, capsys):
         (lambda table: table.assign(qw=table["qw"].where(table.index != 8, 9.0)), "row 9: qw"),
         (lambda table: table.assign(thrust_m2=-0.1), "M2"),
         (lambda table: table.assign(thrust_m2=1e300), "thrust"),
-        (lambda table: table.assign(thrust_m2=1e4), "M2"),
+        (lambda table: table.assign(thrust_m2=1.5e3), "M2"),
         (lambda table: table.assign(gyro_y=table["gyro_y"].where(table.index < 99, 400)), "gyro"),
         (lambda table: table.rename(columns={"vz": "vx"}), "twice"),
         (lambda table: table.assign(acc_x=0.0, acc_y=0.0, acc_z=1.0), "accelerometer"),
@@ -186,11 +186,21 @@ def test_a_log_that_does_not_fit_is_refused_in_a_line(tmp_path, capsys, change, 
     assert named in error and error.count("\n") == 1
 
 
-def test_rows_without_numbers_are_left_out_and_named(tmp_path):
+@pytest.mark.parametrize(
+    ("column", "rows", "value", "note"),
+    [
+        ("gyro_x", slice(None, None, 10), np.nan, "60 of 600 rows"),
+        ("thrust_m2", slice(300, 301), 1e4, "2 of 600 rows"),
+    ],
+)
+def test_rows_that_hold_no_number_or_glitches_are_left_out_and_named(
+    tmp_path, column, rows, value, note
+):
     table = turning()
-    table.loc[::10, "gyro_x"] = np.nan
+    table.loc[rows, column] = value
     log = read_back(table, tmp_path)
-    assert log.flying.mean() > 0.95 and "60 of 600 rows" in log.notes[0]
+    assert log.flying.mean() > 0.95 and note in log.notes[0]
+    assert log.mean_commands().max() < 0.11
 
 
 def test_on_the_ground_nothing_counts(table, tmp_path):
@@ -274,14 +284,14 @@ def test_motors_in_another_order_are_refused_with_the_one_that_fits(table, tmp_p
     (log,) = read_logs(tmp_path / "log")
     vehicle = load_vehicle("crazyflie")
     thrusts = log.mean_commands() ** 2
-    refuse_other_order(log, vehicle, thrusts)
+    refuse_other_order([log], vehicle, thrusts)
     with pytest.raises(ConfigError, match=r"roll.*\[4, 3, 2, 1\]"):
-        refuse_other_order(log, vehicle, thrusts[:, [3, 2, 1, 0]])
+        refuse_other_order([log], vehicle, thrusts[:, [3, 2, 1, 0]])
     with pytest.raises(ConfigError, match="pitch"):
-        refuse_other_order(log, vehicle, thrusts[:, [1, 2, 3, 0]])
+        refuse_other_order([log], vehicle, thrusts[:, [1, 2, 3, 0]])
     other = vehicle.model_copy(update={"rotor_directions": [1, -1, 1, -1]})
     with pytest.raises(ConfigError, match=r"yaw.*rotor_directions"):
-        refuse_other_order(log, other, thrusts)
+        refuse_other_order([log], other, thrusts)
 
 
 @pytest.mark.slow
@@ -298,6 +308,17 @@ def test_the_fit_gives_back_what_flew(tmp_path):
     np.testing.assert_allclose(fit.curve.thrust(commands), expected, rtol=0.05)
     held = {one.field: one.reason for one in fit.estimates.itertuples() if one.reason}
     assert "no velocity" in held["drag"]
+    # What a motor does at its least command, no flight tells.
+    assert fit.vehicle.thrust_range[0] == pytest.approx(start.thrust_range[0])
+
+
+@pytest.mark.slow
+def test_a_gyro_in_another_unit_is_refused_by_the_inertia(table, tmp_path):
+    other = table.copy()
+    other[GYRO_COLUMNS] /= 9.81
+    write_plain(tmp_path / "log", other)
+    with pytest.raises(ConfigError, match="gyro's unit"):
+        fit_vehicle(read_logs(tmp_path / "log"), load_vehicle("crazyflie"))
 
 
 @pytest.mark.slow

@@ -26,12 +26,15 @@ def recorded_attitudes(path: Path, series: FloatArray, grid: FloatArray) -> Rota
     :param series: times, s, and quaternions (w, x, y, z), (samples, 5).
     :raises ConfigError: these are no quaternions.
     """
+    time = series[:, 0]
     norms = np.linalg.norm(series[:, 1:], axis=1)
     worst = np.abs(norms - 1.0).argmax()
-    if not 0.9 < norms[worst] < 1.1:
-        raise ConfigError(f"{path}: row {worst + 1}: qw, qx, qy, qz have length {norms[worst]:.3g}")
+    norm = norms[worst]
+    if not 0.9 < norm < 1.1:
+        raise ConfigError(f"{path}: row {worst + 1}: qw, qx, qy, qz have length {norm:.3g}")
     recorded = Rotation.from_quat(series[:, [2, 3, 4, 1]])
-    return Slerp(series[:, 0], recorded)(grid)
+    between = Slerp(time, recorded)
+    return between(grid)
 
 
 def clock_offset(
@@ -42,12 +45,16 @@ def clock_offset(
     :raises ConfigError: they contradict each other.
     """
     step = grid[1] - grid[0]
-    turned = (attitude[:-2].inv() * attitude[2:]).as_rotvec() / (2.0 * step)
-    rates = np.pad(turned, ((1, 1), (0, 0)), "edge")[flying]
-    gyros = np.array([interpolated(gyro, grid[flying] + behind) for behind in OFFSETS])
-    costs = np.square(gyros - rates).sum(axis=(1, 2))
+    turns = attitude[:-2].inv() * attitude[2:]
+    rates = turns.as_rotvec() / (2.0 * step)
+    rates = np.pad(rates, ((1, 1), (0, 0)), "edge")[flying]
+    times = grid[flying]
+    gyros = [interpolated(gyro, times + behind) for behind in OFFSETS]
+    costs = [np.square(one - rates).sum() for one in gyros]
+    best = int(np.argmin(costs))
     # The first one is 0, and noise alone must not move the clock.
-    best = costs.argmin() if costs.min() < WORTH_A_SHIFT * costs[0] else 0
+    if costs[best] > WORTH_A_SHIFT * costs[0]:
+        best = 0
     refuse_unlike(path, "gyro", gyros[best], rates, step)
     return float(OFFSETS[best])
 
@@ -60,8 +67,9 @@ def mounting(attitude: Rotation, velocity: FloatArray, force: FloatArray) -> Rot
     :param force: specific force, (n, 3), world frame, m/s².
     """
     inverse = attitude.inv()
+    airspeed = inverse.apply(velocity)
     # Drag tilts the mean force of a flight whose mean velocity is not zero.
-    causes = np.insert(inverse.apply(velocity), 0, 1.0, axis=1)
-    (at_rest, *_), *_ = np.linalg.lstsq(causes, inverse.apply(force), rcond=None)
-    x, y, z = at_rest
+    causes = np.insert(airspeed, 0, 1.0, axis=1)
+    fitted = np.linalg.lstsq(causes, inverse.apply(force), rcond=None)[0]
+    x, y, z = fitted[0]
     return Rotation.from_rotvec([-y / z, x / z, 0.0])

@@ -27,19 +27,23 @@ class Curve(NamedTuple):
 
     def thrust(self, commands: FloatArray) -> FloatArray:
         """Return thrusts, N, of commands of any shape."""
-        return np.asarray(powers(self.kind, commands) @ self.coefficients)
+        terms = powers(self.kind, commands)
+        return np.asarray(terms @ self.coefficients)
 
 
 def powers(kind: str, commands: FloatArray) -> FloatArray:
     """Return the powers of commands that their thrusts consist of, along a new last axis."""
-    return np.stack([commands**power for power in POWERS[kind]], axis=-1)
+    terms = [commands**power for power in POWERS[kind]]
+    return np.stack(terms, axis=-1)
 
 
 def lagged(values: FloatArray, gain: float, step: float) -> FloatArray:
     """Return the response of a first-order lag to values, (n, columns), that begins at rest."""
     kept = np.exp(-gain * step)
-    response, _ = lfilter([1.0 - kept], [1.0, -kept], values, axis=0, zi=kept * values[:1])
-    return np.asarray(response)
+    begin = kept * values[:1]
+    response: FloatArray
+    response, _ = lfilter([1.0 - kept], [1.0, -kept], values, axis=0, zi=begin)
+    return response
 
 
 def fit_curve(logs: Sequence[Log], vehicle: Vehicle) -> Curve:
@@ -49,7 +53,9 @@ def fit_curve(logs: Sequence[Log], vehicle: Vehicle) -> Curve:
     """
     if logs[0].kind == "thrust":
         return Curve("thrust", np.ones(1))
-    return regress(logs, vehicle, vehicle.motor_gain_up, vehicle.delay * vehicle.control_step)[0]
+    delay = vehicle.delay * vehicle.control_step
+    curve, _ = regress(logs, vehicle, vehicle.motor_gain_up, delay)
+    return curve
 
 
 def regress(
@@ -65,10 +71,11 @@ def regress(
     forces = []
     for log in logs:
         terms = powers(kind, log.mean_commands(delay)).sum(axis=1)
+        response = lagged(terms, gain, log.step)
         # A row's command acts until the next one, where the force of that row is.
-        rows = log.flying[1:]
-        regressors.append(lagged(terms, gain, log.step)[:-1][rows] / vehicle.mass)
-        forces.append(log.force[1:, 2][rows])
+        rows = np.flatnonzero(log.flying[1:])
+        regressors.append(response[rows] / vehicle.mass)
+        forces.append(log.force[rows + 1, 2])
     left = np.concatenate(regressors)
     right = np.concatenate(forces)
     # Hardly excited powers must not be taken for large numbers that cancel each other.
@@ -77,42 +84,51 @@ def regress(
     return Curve(kind, coefficients), float(np.std(right - left @ coefficients))
 
 
-def refuse_other_order(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> None:
-    """Refuse a log that turns as with rotors in another order, or props that turn the other way.
+def refuse_other_order(logs: Sequence[Log], vehicle: Vehicle, thrusts: FloatArray) -> None:
+    """Refuse logs that turn as with rotors in another order, or props that turn the other way.
 
-    :param thrusts: commanded, in the vehicle's order, (n, 4), N.
+    In a calm flight, the controller's answer to a turn hides what the motors do, so the liveliest
+    one counts most.
+
+    :param thrusts: commanded, of all rows of all logs, in the vehicle's order, (n, 4), N.
     :raises ConfigError: with the axes that answer otherwise, and the order that fits.
     """
     orders = [*permutations(range(4))]
-    agreements = [_agreement(log, vehicle, thrusts[:, order]) for order in orders]
+    agreements = [_agreement(logs, vehicle, thrusts[:, order]) for order in orders]
     both = np.vstack([agreements, agreements * np.array([1.0, 1.0, -1.0])])
     best = both.sum(axis=1).argmax()
     better = both[best] - both[0]
     if better.sum() < LEAST_BETTER:
         return
     named = [("roll", "pitch", "yaw")[axis] for axis in np.flatnonzero(better > 0.1)]
-    order = [motor + 1 for motor in orders[best % len(orders)]]
+    turned, best = divmod(best, len(orders))
+    order = [motor + 1 for motor in orders[best]]
     props = ""
-    if best >= len(orders):
+    if turned:
         props = ", with props that turn the other way (rotor_directions)"
     raise ConfigError(
-        f"{log.path}: {' and '.join(named)}: the motors of {vehicle.name} turn it otherwise; the "
-        f"log fits its motors in the order {order}{props}; check axes and signs, too"
+        f"{logs[0].path}: {' and '.join(named)}: the motors of {vehicle.name} turn it otherwise; "
+        f"the log fits its motors in the order {order}{props}; check axes and signs, too"
     )
 
 
-def _agreement(log: Log, vehicle: Vehicle, thrusts: FloatArray) -> FloatArray:
+def _agreement(logs: Sequence[Log], vehicle: Vehicle, thrusts: FloatArray) -> FloatArray:
     """Return the correlation of body accelerations with moments about each axis, (3,), for that lag
     up to 0.1 s where it is largest; 0 where nothing changes.
     """
-    moments = lagged(thrusts, 30.0, log.step) @ vehicle.mixer[1:].T
-    rates = log.motion[:, BODY_RATES]
-    near = max(round(0.02 / log.step), 1)
+    step = logs[0].step
+    flying = np.concatenate([log.flying for log in logs])
+    rates = np.concatenate([log.motion[:, BODY_RATES] for log in logs])
+    moments = lagged(thrusts, 30.0, step) @ vehicle.mixer[1:].T
+    near = max(round(0.02 / step), 1)
     turned = np.roll(rates, -near, axis=0) - rates
     correlations = []
     for lag in range(0, 5 * near, near):
-        both = np.hstack([np.roll(turned, -lag, axis=0), moments])[log.flying]
+        later = np.roll(turned, -lag, axis=0)
+        both = np.hstack([later, moments])[flying]
         with np.errstate(divide="ignore", invalid="ignore"):
-            correlations.append(np.diagonal(np.corrcoef(both, rowvar=False), 3))
+            matrix = np.corrcoef(both.T)
+        correlations.append(np.diagonal(matrix, 3))
     known = np.nan_to_num(correlations)
-    return np.asarray(known[np.abs(known).argmax(axis=0), range(3)])
+    largest = np.abs(known).argmax(axis=0)
+    return np.asarray(known[largest, range(3)])

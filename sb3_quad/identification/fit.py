@@ -13,23 +13,26 @@ import numpy as np
 import pandas as pd
 
 from sb3_quad.base.errors import ConfigError, raised_as
-from sb3_quad.base.types import StrDict
+from sb3_quad.base.types import FloatArray, StrDict
 from sb3_quad.envs.vehicles.vehicle import MAX_PHYSICS_STEP, Vehicle
 from sb3_quad.identification.curve import Curve, refuse_other_order, regress
 from sb3_quad.identification.flight_log import Log
 from sb3_quad.identification.intervals import jackknife, not_told
 from sb3_quad.identification.open_loop import log_thrusts
 from sb3_quad.identification.parameters import FASTEST, Guess
-from sb3_quad.identification.prediction_error import Model
+from sb3_quad.identification.prediction_error import Model, Optimum
 
 Show = Callable[[int, int, str], object]
 # Short and long horizons of logs with velocity, and of body rates alone, s
-HORIZONS = np.array([0.02, 0.05, 0.1]), np.array([0.05, 0.1, 0.2, 0.3, 0.5])
+HORIZONS = np.array([0.02, 0.05, 0.1]), np.linspace(0.05, 0.5, 10)
 HORIZONS_OF_RATES = np.arange(0.02, 0.11, 0.02), np.arange(0.02, 0.21, 0.02)
 # Lags and delays that the regression tries, s
 LAGS = np.array([0.01, 0.015, 0.02, 0.03, 0.045, 0.06, 0.08, 0.11, 0.15])
 DELAYS = np.arange(0.0, 0.035, 0.005)
 MOST_THRUST = 30.0  # of a motor at full command, by what it needs to hover
+# Radii of gyration by the rotors' distance from the centre, beyond which a unit is wrong
+LEAST_GYRATION = 0.2
+MOST_GYRATION = 2.0
 # No interval is narrower than this part of its value or size, or this many seconds of a delay:
 # simulated logs with noise show such errors beyond the jackknife's intervals.
 LEAST_WIDTH = 0.03
@@ -64,40 +67,54 @@ def fit_vehicle(
     report(1, 3, "predictions")
     short, long = HORIZONS if logs[0].has_motion else HORIZONS_OF_RATES
     model = Model(logs, guess, short)
-    free = model.free()
-    optimum = model.solve(model.vector_of(guess), free, 10)
+    optimum = model.solve(model.vector_of(guess), 10)
     # Sizes are those of the fit so far, since damping grows with the inertia.
     guess = model.guess(optimum.vector)
     model = Model(logs, guess, long)
     vector = model.vector_of(guess)
     model.weigh(vector)
-    optimum = model.solve(vector, free, 6)
+    optimum = model.solve(vector, 12)
     report(2, 3, "what the logs tell")
-    vector = optimum.vector
     before = guess._replace(vehicle=start)
     known = model.vector_of(before)
-    table = model.table
-    for place, reason in not_told(model, optimum, free).items():
-        vector[place] = known[place]
-        table.loc[place, "reason"] = reason
+    while held := not_told(model, optimum):
+        vector = optimum.vector
+        for place, reason in held.items():
+            vector[place] = known[place]
+            model.table.loc[place, "reason"] = reason
+        model.weigh(vector)
+        optimum = model.solve(vector, 6)
     free = model.free()
-    model.weigh(vector)
-    optimum = model.solve(vector, free, 4)
     known[free] = optimum.vector[free]
+    table = _with_intervals(model, optimum, known * model.scale)
     table["start"] = before.vector()
-    table["value"] = known * model.scale
-    table["width"] = np.nan
-    table.loc[free, "width"] = jackknife(optimum.slopes, optimum.errors) * model.scale[free]
-    delay = len(guess.curve.coefficients)
-    least = LEAST_WIDTH * np.maximum(table["value"].abs(), table["size"])
-    least[delay] = LEAST_DELAY_WIDTH
-    table["width"] = table["width"].clip(least)
     report(3, 3, "done")
     with raised_as(ConfigError, f"{logs[0].path}: the fit is no vehicle that can fly"):
-        fitted = before.moved(known * model.scale)
+        fitted = before.moved(table["value"].to_numpy())
+    ratios = fitted.vehicle.gyration_ratios
+    if ratios.min() < LEAST_GYRATION or ratios.max() > MOST_GYRATION:
+        raise ConfigError(
+            f"{logs[0].path}: the moments of inertia would have radii of {ratios.min():.2g} to "
+            f"{ratios.max():.2g} of the rotors' distance; are the gyro's unit, the mass and the "
+            "rotors' positions right?"
+        )
     steps = round(fitted.delay / start.control_step)
-    has_lag = table["reason"][delay + 1] == ""
+    has_lag = table.set_index("field")["reason"]["motor_gain_up"] == ""
     return Fit(_with_limits(fitted, name, steps, has_lag), fitted.curve, table)
+
+
+def _with_intervals(model: Model, optimum: Optimum, values: FloatArray) -> pd.DataFrame:
+    """Return the table of a model with values and the widths of those that are fitted."""
+    free = model.free()
+    widths = jackknife(optimum.slopes, optimum.errors)
+    table = model.table
+    least = LEAST_WIDTH * np.maximum(np.abs(values), table["size"])
+    least = least.where(table["field"] != "delay", LEAST_DELAY_WIDTH)
+    table["value"] = values
+    table["width"] = np.nan
+    table.loc[free, "width"] = widths * model.scale[free]
+    table["width"] = table["width"].clip(least)
+    return table
 
 
 def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
@@ -106,14 +123,15 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
     :raises ConfigError: motors turn the vehicle otherwise than its file says.
     """
     kind = logs[0].kind
-    gains = np.array([FASTEST]) if kind == "rotor_speed" else 1.0 / LAGS
+    gains = 1.0 / LAGS
+    if kind == "rotor_speed":
+        gains = np.array([FASTEST])
     pairs = [*product(gains.tolist(), DELAYS.tolist())]
     curves = [regress(logs, start, *pair) for pair in pairs]
     best = int(np.argmin([rest for _, rest in curves]))
     curve, _ = curves[best]
     gain, delay = pairs[best]
-    for log in logs:
-        refuse_other_order(log, start, log_thrusts([log], start, curve, delay))
+    refuse_other_order(logs, start, log_thrusts(logs, start, curve, delay))
     strongest = max(curve.thrust(log.mean_commands()).max() for log in logs)
     step = logs[0].step
     changes: StrDict = {
@@ -145,12 +163,10 @@ def _with_limits(fitted: Guess, name: str, delay: int, has_lag: bool) -> Vehicle
     if has_lag:
         lag = 1.0 / vehicle.motor_gain_up + fitted.delay - delay * vehicle.control_step
         changes["motor_gain"] = 1.0 / max(lag, 1.0 / FASTEST)
-    limits = {
-        "thrust": vehicle.thrust_range,
-        "share": (0.0, 1.0),
-        "rotor_speed": vehicle.rotor_speed_range,
-    }
-    low, high = fitted.curve.thrust(np.array(limits[fitted.curve.kind]))
+    low, most = vehicle.thrust_range
+    _, fastest = vehicle.rotor_speed_range
+    full = {"thrust": most, "share": 1.0, "rotor_speed": fastest}
+    high = fitted.curve.thrust(np.array(full[fitted.curve.kind]))
     if not 1.05 < high / vehicle.hover_thrust < MOST_THRUST:
         raise ConfigError(
             f"the motors would push with {high:.3g} N at full command, and {vehicle.name} needs "
@@ -159,5 +175,6 @@ def _with_limits(fitted: Guess, name: str, delay: int, has_lag: bool) -> Vehicle
         )
     if fitted.curve.kind == "rotor_speed":
         changes["thrust_coefficient"] = float(fitted.curve.coefficients[0])
-    changes["rotor_thrust_limits"] = max(low, 0.01 * vehicle.hover_thrust), high
+    # No flight tells what a motor that gets hardly anything does.
+    changes["rotor_thrust_limits"] = low, float(high)
     return vehicle.model_copy(update=changes)

@@ -34,8 +34,12 @@ def estimate_table(fit: Fit) -> Table:
     mass = f"{fit.vehicle.mass:.4g}"
     rows = [["mass", mass, mass, "kg", "held: logs tell thrust and moments by mass alone"]]
     for one in fit.estimates.itertuples():
-        interval = f"held: {one.reason}" if one.reason else f"± {one.width:.2g}"
-        rows.append([one.name, f"{one.start:.4g}", f"{one.value:.4g}", one.unit, interval])
+        interval = f"± {one.width:.2g}"
+        if one.reason:
+            interval = f"held: {one.reason}"
+        before = f"{one.start:.4g}"
+        after = f"{one.value:.4g}"
+        rows.append([one.name, before, after, one.unit, interval])
     heads = ("parameter", "start", "fitted", "unit", "95 % interval")
     return Table(heads, rows, fit.vehicle.name, align="left")
 
@@ -49,7 +53,7 @@ def write_vehicle(path: StrPath, fit: Fit, logs: Sequence[Log]) -> None:
     names = ", ".join(dict.fromkeys(log.path.name for log in logs))
     table = estimate_table(fit).markdown()
     comments = f"Fitted by sb3-quad fit to {seconds:.0f} s of {names}.\n{table}\n"
-    content = json.dumps(fit.vehicle.model_dump(mode="json", exclude_defaults=True))
+    content = fit.vehicle.model_dump_json(exclude_defaults=True)
     short = json.loads(content, parse_float=_short)
     text = yaml.safe_dump(short, sort_keys=False, default_flow_style=None)
     write_text(path, indent(comments, "# ") + text)
@@ -81,9 +85,12 @@ def prediction_plot(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> Figu
     all_axes = figure.subplots(len(panels), 3, squeeze=False, sharex=True)
     for line, (name, unit, part) in zip(all_axes, panels, strict=True):
         for k, axes in enumerate(line, part.start):
-            axes.plot(step * recorded, log.motion[recorded, k], "k", label="measured")
-            axes.plot(step * rows, predicted[:, shown, k], color=COLOURS[1], label="predicted")
-            axes.set(ylabel=f"{name} {'xyz'[k - part.start]} ({unit})", xlabel="time (s)")
+            measured = log.motion[recorded, k]
+            axes.plot(step * recorded, measured, "k", label="measured")
+            flight = predicted[:, shown, k]
+            axes.plot(step * rows, flight, color=COLOURS[1], label="predicted")
+            axis = "xyz"[k - part.start]
+            axes.set(ylabel=f"{name} {axis} ({unit})", xlabel="time (s)")
     legend(figure)
     return figure
 

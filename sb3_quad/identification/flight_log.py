@@ -50,8 +50,10 @@ class Log:
     def mean_velocity(self) -> FloatArray:
         """Mean velocity in the air, (3,), body axes, m/s."""
         motion = self.motion[self.flying]
-        velocity = attitudes(motion).inv().apply(motion[:, VELOCITY])
-        return np.asarray(velocity.mean(axis=0))
+        to_body = attitudes(motion).inv()
+        velocity = to_body.apply(motion[:, VELOCITY])
+        mean: FloatArray = velocity.mean(axis=0)
+        return mean
 
     def part(self, rows: slice) -> "Log":
         """Return a log with some rows that count alone."""
@@ -62,12 +64,14 @@ class Log:
 
 def attitudes(motion: FloatArray) -> Rotation:
     """Return the rotations from body to world of motions, (n, 13)."""
-    return Rotation.from_quat(motion[:, QUATERNION][:, [1, 2, 3, 0]])
+    w, *xyz = motion[:, QUATERNION].T
+    return Rotation.from_quat(np.array([*xyz, w]).T)
 
 
 def quaternions(rotations: Rotation) -> FloatArray:
     """Return the quaternions (w, x, y, z) of rotations, (n, 4)."""
-    return np.asarray(rotations.as_quat(canonical=True)[:, [3, 0, 1, 2]])
+    xyzw = rotations.as_quat(canonical=True)
+    return np.roll(xyzw, 1, axis=1)
 
 
 def rotor_columns(log: Log, vehicle: Vehicle) -> list[int]:
@@ -77,7 +81,8 @@ def rotor_columns(log: Log, vehicle: Vehicle) -> list[int]:
     """
     if not log.order:
         return [0, 1, 2, 3]
-    places = vehicle.rotor_positions - np.mean(vehicle.rotor_positions, axis=0)
+    centre = np.mean(vehicle.rotor_positions, axis=0)
+    places = vehicle.rotor_positions - centre
     wanted = [tuple(place) for place in np.sign(places).tolist()]
     order = ORDERS[log.order]
     arms = np.abs(places)

@@ -7,7 +7,7 @@ linearised at the optimum.
 import numpy as np
 from scipy.stats import t as student
 
-from sb3_quad.base.types import FloatArray, IntArray
+from sb3_quad.base.types import FloatArray
 from sb3_quad.identification.prediction_error import Model, Optimum
 
 BLOCKS = 20
@@ -32,30 +32,34 @@ def jackknife(slopes: FloatArray, errors: FloatArray) -> FloatArray:
     right = np.sum(products, axis=0) - products
     shifts = np.einsum("bij,bj->bi", np.linalg.pinv(left), right)
     spread = np.std(shifts, axis=0) * np.sqrt(count - 1)
-    return np.asarray(student.ppf(0.975, count - 1) * spread)
+    widths: FloatArray = student.ppf(0.975, count - 1) * spread
+    return widths
 
 
-def not_told(model: Model, optimum: Optimum, free: IntArray) -> dict[int, str]:
+def not_told(model: Model, optimum: Optimum) -> dict[int, str]:
     """Return which elements of the vector the logs do not tell, and why.
 
     The least certain one is held first, which makes the others more certain.
     """
     held = {}
-    values = optimum.vector
+    free = model.free()
+    values = optimum.vector[free]
+    units = model.scale[free]
     # A value that runs away says nothing.
-    least, most = model.table[["least", "most"]].to_numpy().T
+    least, most = model.table.loc[free, ["least", "most"]].to_numpy().T
     far = (least > 0.0) & ((values < 1.02 * least) | (values > 0.98 * most))
-    for place in free[far[free]].tolist():
-        held[place] = f"it would run to {values[place] * model.scale[place]:.2g}"
+    for k in np.flatnonzero(far):
+        held[k] = f"it would run to {values[k] * units[k]:.2g}"
     # Thrust and delay are always fitted.
     always = len(model.start.curve.coefficients) + 1
     while True:
-        kept = np.flatnonzero(~np.isin(free, [*held]))
+        kept = np.setdiff1d(range(len(free)), [*held])
         widths = jackknife(optimum.slopes[:, :, kept], optimum.errors)
-        shares = widths / np.maximum(np.abs(values[free[kept]]), 1e-9)
+        shares = widths / np.maximum(np.abs(values[kept]), 1e-9)
         shares[:always] = 0.0
         worst = shares.argmax()
         if shares[worst] <= LARGEST_WIDTH:
-            return held
-        place = int(free[kept[worst]])
-        held[place] = f"its interval would be ± {widths[worst] * model.scale[place]:.2g}"
+            break
+        k = kept[worst]
+        held[k] = f"its interval would be ± {widths[worst] * units[k]:.2g}"
+    return {int(free[k]): reason for k, reason in held.items()}

@@ -8,10 +8,16 @@ from scipy.signal import savgol_filter
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, FloatArray, StrPath
+from sb3_quad.base.validate import LARGEST
 from sb3_quad.envs.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from sb3_quad.identification.alignment import clock_offset, mounting, recorded_attitudes
 from sb3_quad.identification.flight_log import MOTION_SIZE, UPWARD, Log, quaternions
-from sb3_quad.identification.plausible import LEAST_DURATION, in_the_air, refuse_unlike
+from sb3_quad.identification.plausible import (
+    LARGEST_COMMANDS,
+    LEAST_DURATION,
+    in_the_air,
+    refuse_unlike,
+)
 from sb3_quad.identification.readers import (
     COMMANDS,
     WAY_OUT,
@@ -80,7 +86,9 @@ def on_grid(recording: Recording, step: float) -> Log:
     """Return a log with rows ``step`` s apart, see :func:`read_logs`."""
     path, order, series = recording
     notes: list[str] = []
-    series = {name: cleaned(f"{path}: {name}", one, notes) for name, one in series.items()}
+    for name, one in series.items():
+        largest = LARGEST_COMMANDS.get(name, LARGEST)
+        series[name] = cleaned(f"{path}: {name}", one, largest, notes)
     kind = next(name for name in COMMANDS if name in series)
     commands = series.pop(kind)
     if "battery" in series:

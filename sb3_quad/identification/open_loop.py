@@ -1,6 +1,7 @@
 """Recorded commands flown again from recorded states, and how far that is off."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -31,6 +32,7 @@ HORIZONS = (0.1, 0.2, 0.5)  # s
 # Time before a window whose commands spin up the rotors, s
 WARM_UP = 0.25
 QUANTITIES = ("position, m", "velocity, m/s", "attitude, °", "body rates, rad/s")
+ATTITUDE = 2
 
 
 class Windows:
@@ -87,12 +89,14 @@ class Windows:
         # Commands that still wait are given first.
         for now in range(-vehicle.delay, self.ends[-1]):
             if now == 0:
+                before = self.rows - vehicle.delay - 1
+                batch.state[ROTOR_SPEEDS] = speeds[before].T
                 batch.state[:MOTION_SIZE] = self.start.T
-                batch.state[ROTOR_SPEEDS] = speeds[self.rows - vehicle.delay - 1].T
             batch.step(actions[self.rows + now])
             if now + 1 in self.ends:
                 state = batch.true_state()
-                yield state.array[:MOTION_SIZE].T.copy(), state.specific_force
+                motion = state.array[:MOTION_SIZE]
+                yield motion.T.copy(), state.specific_force
 
 
 def log_thrusts(
@@ -119,9 +123,12 @@ def gaps(motion: FloatArray, record: FloatArray) -> list[FloatArray]:
     """Return how far predictions (n, 13) are off what was recorded, (n, 3) each, in the order and
     units of ``QUANTITIES`` but rad: attitudes as rotation vectors in recorded body axes.
     """
-    turned = (attitudes(record).inv() * attitudes(motion)).as_rotvec()
+    turned = attitudes(record).inv() * attitudes(motion)
     gap = motion - record
-    return [gap[:, POSITION], gap[:, VELOCITY], turned, gap[:, BODY_RATES]]
+    position = gap[:, POSITION]
+    velocity = gap[:, VELOCITY]
+    rates = gap[:, BODY_RATES]
+    return [position, velocity, turned.as_rotvec(), rates]
 
 
 def open_loop(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> FloatArray:
@@ -147,13 +154,16 @@ def open_loop(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> FloatArray
     errors = []
     for end, (flown, _) in zip(ends, windows.fly(vehicle, thrusts), strict=True):
         time = end * vehicle.control_step
-        stays[:, POSITION] = start[:, POSITION] + start[:, VELOCITY] * time
-        rotation = attitudes(start) * Rotation.from_rotvec(start[:, BODY_RATES] * time)
-        stays[:, QUATERNION] = quaternions(rotation)
+        way = start[:, VELOCITY] * time
+        stays[:, POSITION] = start[:, POSITION] + way
+        turn = Rotation.from_rotvec(start[:, BODY_RATES] * time)
+        stays[:, QUATERNION] = quaternions(attitudes(start) * turn)
         record = windows.record[windows.rows + end]
         errors.append([gaps(flown, record), gaps(stays, record)])
-    squares = np.square(errors).sum(axis=4).mean(axis=3)
-    return np.asarray(np.sqrt(squares) * [1.0, 1.0, 180.0 / np.pi, 1.0])
+    squares = np.square(errors).sum(axis=4)
+    typical: FloatArray = np.sqrt(squares.mean(axis=3))
+    typical[..., ATTITUDE] *= 180.0 / np.pi
+    return typical
 
 
 def error_table(logs: Sequence[Log], vehicles: Mapping[str, tuple[Vehicle, Curve | None]]) -> Table:
@@ -162,18 +172,17 @@ def error_table(logs: Sequence[Log], vehicles: Mapping[str, tuple[Vehicle, Curve
     :param vehicles: by the heading of their column, with the thrust of a motor over its command, or
         None: fitted to these logs.
     """
-    errors = []
+    columns = []
     for vehicle, curve in vehicles.values():
-        both = open_loop(logs, vehicle, curve or fit_curve(logs, vehicle))
-        errors.append(both[:, 0])
-    errors.append(both[:, 1])
-    columns = np.stack(errors, axis=-1)
+        known = curve or fit_curve(logs, vehicle)
+        predicted, stays = np.moveaxis(open_loop(logs, vehicle, known), 1, 0)
+        columns.append(predicted)
+    errors = np.stack([*columns, stays], axis=-1)
     rows = []
-    # Without motion, body rates are all that is known.
-    known = 0 if logs[0].has_motion else len(QUANTITIES) - 1
-    for number, quantity in enumerate(QUANTITIES[known:], known):
-        for horizon, values in zip(HORIZONS, columns[:, number], strict=True):
-            cells = [f"{value:.3g}" for value in values]
+    for (number, quantity), (k, horizon) in product(enumerate(QUANTITIES), enumerate(HORIZONS)):
+        # Without motion, body rates are all that is known.
+        if logs[0].has_motion or quantity.startswith("body rates"):
+            cells = [f"{value:.3g}" for value in errors[k, number]]
             rows.append([f"{quantity}, after {horizon:g} s", *cells])
     heads = ("root mean square of the error", *vehicles, "velocity, rates stay")
     return Table(heads, rows, f"{len(logs)} logs, open loop")

@@ -25,6 +25,8 @@ LEAST_AGREEMENT = 0.1
 AVERAGED = 0.1  # s
 # Mean commands in flight: N, rad/s, and a part of the full command
 LIKELY = {"thrust": (1e-3, 1e3), "rotor_speed": (50.0, 1e4), "share": (0.05, 1.0)}
+# Beyond these, single commands are glitches
+LARGEST_COMMANDS = {"thrust": 2e3, "rotor_speed": 2e4}
 MOST_RATE = 100.0  # rad/s, beyond what gyros measure
 
 

@@ -16,12 +16,13 @@ from sb3_quad.identification.open_loop import Windows, gaps, log_thrusts
 from sb3_quad.identification.parameters import Guess, parameters_of
 from sb3_quad.identification.smoothing import smoothed
 
+# Windows overlap; nearer ones, s, hardly tell more.
+APART = 0.16
 MOST_WINDOWS = 750
 # Of position, velocity, attitude, body rates and specific force, in the units of the motion: errors
 # of this size count as one in the first fit.
 ERRORS = (0.1, 0.4, 0.15, 0.4, 2.0)
 RATES = 3
-FORCE = 4
 DIFFERENCE = 2e-3
 
 
@@ -55,7 +56,7 @@ class Model:
         stride = ends[-1]
         if self.has_motion:
             flying = sum(log.flying.sum() for log in logs)
-            stride = max(1, flying // MOST_WINDOWS)
+            stride = max(round(APART / step), flying // MOST_WINDOWS)
         self.windows = Windows(logs, start.vehicle, ends, stride)
         if self.has_motion:
             # The noise of where a window begins would grow with some parameters, and bias them.
@@ -88,38 +89,38 @@ class Model:
         errors = []
         for end, (motion, force) in zip(windows.ends, flown, strict=True):
             rows = windows.rows + end
-            errors.append([*gaps(motion, windows.record[rows]), force - self.force[rows]])
-        parts = [np.stack(part, axis=1) for part in zip(*errors, strict=True)]
-        # The first body rate of a window is as noisy as the others: only changes count. Where the
-        # airspeed is unknown, so are the moments of the air, which change slowly.
-        kind = "constant" if self.has_motion else "linear"
-        parts[RATES] = detrend(parts[RATES], 1, kind)
-        # An accelerometer is hardly mounted exactly.
-        parts[FORCE][..., :2] -= parts[FORCE][..., :2].mean(axis=(0, 1))
+            errors.append(gaps(motion, windows.record[rows]))
+            errors[-1].append(force - self.force[rows])
+        *others, rates, forces = (np.stack(part, axis=1) for part in zip(*errors, strict=True))
         if not self.has_motion:
-            # What depends on attitude and airspeed is unknown.
-            return [parts[RATES], parts[FORCE][..., 2:]]
-        return parts
+            # What depends on attitude and airspeed is unknown, and the moments of the air change
+            # slowly.
+            return [detrend(rates, 1, "linear"), forces[..., 2:]]
+        # The first body rate of a window is as noisy as the others: only changes count.
+        rates = detrend(rates, 1, "constant")
+        # An accelerometer is hardly mounted exactly.
+        forces[..., :2] -= forces[..., :2].mean(axis=(0, 1))
+        return [*others, rates, forces]
 
     def residuals(self, vector: FloatArray) -> FloatArray:
         """Return the errors that logs tell by their sizes, (windows, n)."""
         scaled = []
         for part, size in zip(self.parts(vector), self.sizes, strict=True):
-            scaled.append((part / size).reshape(len(part), -1))
+            flat = (part / size).reshape(len(part), -1)
+            scaled.append(flat)
         # Predictions that diverge must not become infinite.
         return np.asarray(np.clip(np.hstack(scaled), -1e3, 1e3))
 
     def weigh(self, vector: FloatArray) -> None:
         """Count errors by the size that they have now, each column after each horizon."""
         for number, part in enumerate(self.parts(vector)):
-            spread = 1.4826 * np.median(np.abs(part), axis=0)
-            self.sizes[number] = np.maximum(spread, 1e-3 * self.usual[number])
+            median = np.median(np.abs(part), axis=0)
+            least = 1e-3 * self.usual[number]
+            self.sizes[number] = np.maximum(1.4826 * median, least)
 
-    def solve(self, vector: FloatArray, free: IntArray, evaluations: int) -> Optimum:
-        """Find the vector with the least errors (soft L1) near a start.
-
-        :param free: the elements of the vector that may change.
-        """
+    def solve(self, vector: FloatArray, evaluations: int) -> Optimum:
+        """Find the free elements of a vector with the least errors (soft L1) near a start."""
+        free = self.free()
         fitted = vector.copy()
 
         def residuals(values: FloatArray) -> FloatArray:
@@ -130,7 +131,7 @@ class Model:
             here = residuals(values)
             steps = DIFFERENCE * np.eye(len(free))
             changes = [residuals(values + step) - here for step in steps]
-            return np.stack(changes, axis=1) / DIFFERENCE
+            return np.array(changes).T / DIFFERENCE
 
         limits = self.table.loc[free, ["least", "most"]].to_numpy().T
         solution = least_squares(

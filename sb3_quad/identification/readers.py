@@ -25,12 +25,18 @@ from sb3_quad.identification.series import interpolated
 
 LARGEST_LOG = 300_000_000  # bytes
 LONGEST_NAME = 100  # bytes
+LONGEST_HEADERS = 100_000  # bytes
 FORMATS = read_yaml(Path(__file__).with_name("formats.yaml"))
 UNITS = FORMATS.pop("units")
 ORDERS_OF = FORMATS.pop("orders")
 DOWN = FORMATS.pop("down")
 MARKS = FORMATS.pop("marks")
 COMMANDS = ("thrust", "rotor_speed", "share")
+NEEDED = {
+    "time": ["time"],
+    "motor commands": COMMANDS,
+    "gyro": ["gyro"],
+}
 WAY_OUT = (
     "a log has motor commands, gyro, and an accelerometer or attitude and velocity; "
     "docs/your_vehicle.md lists the columns of each format"
@@ -65,28 +71,32 @@ def read_recording(source: StrPath) -> Recording:
     with raised_as(ConfigError, f"{path}: not a log that can be read"):
         for magic, (name, read) in READERS.items():
             if data.startswith(magic):
-                return _recording(path, name, *read(path, data))
+                parts, headers = read(path, data)
+                return _recording(path, name, parts, headers)
         table, headers = _csv(path, data)
-        name = next((name for name, mark in MARKS.items() if mark in table), "plain CSV")
-        return _recording(path, name, [table], headers)
+        kinds = [name for name, mark in MARKS.items() if mark in table]
+        return _recording(path, [*kinds, "plain CSV"][0], [table], headers)
 
 
 def _recording(path: Path, name: str, parts: Sequence[Part], headers: StrDict) -> Recording:
     """Find the quantities of a format among the columns of a log."""
     units = UNITS | _units(headers)
     ((clock, clock_unit),) = FORMATS[name]["time"].items()
+    _, seconds = units[clock_unit]
     series: dict[str, FloatArray] = {}
     for quantity, options in FORMATS[name].items():
-        for names, unit in options.items():
+        for columns, unit in options.items():
+            names = columns.split()
             zero, scale = units[unit]
             for part in parts:
-                if quantity not in series and {clock, *names.split()} <= part.keys():
-                    columns = [part[column] for column in names.split()]
-                    values = (np.array(columns, float) - zero) * scale
-                    time = np.array(part[clock], float) * units[clock_unit][1]
-                    series[quantity] = np.vstack([time, values]).T
-    for what, names in {"time": ["time"], "motor commands": COMMANDS, "gyro": ["gyro"]}.items():
-        if series.keys().isdisjoint(names):
+                if quantity in series or not {clock, *names} <= part.keys():
+                    continue
+                time = np.array(part[clock], float)
+                values = np.array([part[name] for name in names], float)
+                rows = [seconds * time, *(scale * (values - zero))]
+                series[quantity] = np.array(rows).T
+    for what, some in NEEDED.items():
+        if series.keys().isdisjoint(some):
             raise ConfigError(f"{path}: lacks {what}; {WAY_OUT}")
     del series["time"]
     if name in DOWN:
@@ -100,13 +110,17 @@ def _units(headers: StrDict) -> StrDict:
     """Return the units that the headers of a blackbox say."""
     units: StrDict = {}
     with suppress(KeyError):
-        units["acc_1G"] = 0.0, UNITS["g"][1] / float(headers["acc_1G"])
+        one = float(headers["acc_1G"])
+        _, gravity = UNITS["g"]
+        units["acc_1G"] = 0.0, gravity / one
     # Before Betaflight 3 the gyro had its own unit.
     scale = headers.get("gyro_scale")
     if isinstance(scale, float) and scale != 1.0:
-        units["gyro_scale"] = 0.0, scale * UNITS["deg/s"][1]
+        _, degree = UNITS["deg/s"]
+        units["gyro_scale"] = 0.0, scale * degree
     # The commands for a motor that rests and one at full throttle
-    limits = str(headers.get("motorOutput")).strip("[]").split(",")
+    output = str(headers.get("motorOutput")).strip("[]")
+    limits = output.split(",")
     if len(limits) == 2 and float(limits[1]) <= 2000.0:
         units["DShot"] = UNITS["PWM"]
     return units
@@ -114,12 +128,15 @@ def _units(headers: StrDict) -> StrDict:
 
 def _ulog(path: Path, _data: bytes) -> tuple[list[Part], StrDict]:
     pyulog = require("pyulog", "fit", f"{path}: reading a ULog")
+    log = pyulog.ULog(str(path), disable_str_exceptions=True)
     parts: list[Part] = []
-    for data in pyulog.ULog(str(path), disable_str_exceptions=True).data_list:
+    for data in log.data_list:
+        columns = data.data
+        part = {f"{data.name}.{name}": values for name, values in columns.items()}
+        part["time"] = columns["timestamp"]
         # What a sensor measured was true when it was sampled, what a motor gets when it is sent.
-        sampled = "" if data.name.startswith("actuator") else "timestamp_sample"
-        part = {f"{data.name}.{name}": values for name, values in data.data.items()}
-        part["time"] = data.data.get(sampled, data.data["timestamp"])
+        if not data.name.startswith("actuator"):
+            part["time"] = columns.get("timestamp_sample", part["time"])
         parts.append(part)
     return parts, {}
 
@@ -133,8 +150,10 @@ def _blackbox(path: Path, _data: bytes) -> tuple[list[Part], StrDict]:
         rows.extend(frame.data for frame in parser.frames())
     names = parser.field_names
     # A frame of another kind is shorter, and what a field lacks is no number.
-    table = pd.DataFrame([row for row in rows if len(row) == len(names)], columns=names)
-    return [dict(table.apply(pd.to_numeric, errors="coerce"))], parser.headers
+    whole = [row for row in rows if len(row) == len(names)]
+    table = pd.DataFrame(whole, columns=names)
+    numbers = table.apply(pd.to_numeric, errors="coerce")
+    return [dict(numbers)], parser.headers
 
 
 def _usd(_path: Path, data: bytes) -> tuple[list[Part], StrDict]:
@@ -147,21 +166,27 @@ def _usd(_path: Path, data: bytes) -> tuple[list[Part], StrDict]:
     names: dict[int, list[str]] = {}
     for _ in range(kinds):
         (kind,) = struct.unpack_from("<H", data, place)
-        place = data.index(b"\0", place + 2) + 3
-        (count,) = struct.unpack_from("<H", data, place - 2)
-        *fields, _ = data[place : place + LONGEST_NAME * count].split(b"\0", count)
-        place += len(b"\0".join(fields)) + 1
-        # Its types are those of Python's struct.
-        pairs = [field.decode().split("(") for field in fields]
-        layouts[kind] = struct.Struct(time + "".join(letters[0] for _, letters in pairs))
-        names[kind] = ["timestamp", *(name for name, _ in pairs)]
+        place = data.index(b"\0", place + 2) + 1
+        (count,) = struct.unpack_from("<H", data, place)
+        place += 2
+        names[kind] = ["timestamp"]
+        letters = time
+        for _ in range(count):
+            end = data.index(b"\0", place, place + LONGEST_NAME)
+            name, letter = data[place:end].decode().split("(")
+            names[kind].append(name)
+            # Its types are those of Python's struct.
+            letters += letter[0]
+            place = end + 1
+        layouts[kind] = struct.Struct(letters)
     rows: dict[int, list[Any]] = {kind: [] for kind in layouts}
     # The last four bytes are a checksum; a log that was cut ends anywhere.
     with suppress(struct.error, KeyError):
         while True:
             (kind,) = struct.unpack_from("<H", data, place)
-            rows[kind].append(layouts[kind].unpack_from(data, place + 2))
-            place += 2 + layouts[kind].size
+            layout = layouts[kind]
+            rows[kind].append(layout.unpack_from(data, place + 2))
+            place += 2 + layout.size
     parts: list[Part] = []
     for kind, values in rows.items():
         table = pd.DataFrame(values, columns=names[kind], dtype=float)
@@ -179,16 +204,19 @@ READERS: Mapping[bytes, tuple[str, Callable[[Path, bytes], tuple[list[Part], Str
 
 def _csv(path: Path, data: bytes) -> tuple[Part, StrDict]:
     """Return the table of a CSV file, and the names and values above it."""
-    lines = data.split(b"\n", 400)[:-1]
     # Betaflight's Explorer writes the headers of the log above the names of the columns.
-    skipped = next((k for k, line in enumerate(lines) if b"loopIteration" in line), 0)
+    above, found, _ = data[:LONGEST_HEADERS].partition(b"loopIteration")
+    if not found:
+        above = b""
+    *lines, _ = above.decode(errors="replace").split("\n")
     headers = {}
-    for line in lines[:skipped]:
-        name, _, value = line.decode(errors="replace").partition(",")
+    for line in lines:
+        name, _, value = line.partition(",")
         headers[name.strip('" ')] = value.strip('"\r ')
-    table = read_table(path, LARGEST_LOG, skipped)
+    table = read_table(path, LARGEST_LOG, len(lines))
     # Betaflight's blackbox_decode adds the unit of the time.
-    return dict(table.rename(columns=lambda name: name.removesuffix(" (us)"))), headers
+    named = table.rename(columns=lambda name: name.removesuffix(" (us)"))
+    return dict(named), headers
 
 
 def motor_thrusts(share: FloatArray, battery: FloatArray) -> FloatArray:
@@ -200,6 +228,9 @@ def motor_thrusts(share: FloatArray, battery: FloatArray) -> FloatArray:
     :param battery: times, s, and V, (samples, 2).
     """
     commands = share[:, 1:]
-    valid = share[((commands > 0.0) & (commands <= 1.0)).all(axis=1)]
-    voltage = valid[:, 1:] * interpolated(battery, valid[:, 0])
-    return np.insert(np.polynomial.Polynomial(THRUST_BY_VOLTAGE)(voltage), 0, valid[:, 0], axis=1)
+    within = (commands > 0.0) & (commands <= 1.0)
+    valid = share[within.all(axis=1)]
+    time = valid[:, :1]
+    voltages = valid[:, 1:] * interpolated(battery, time[:, 0])
+    thrust = np.polynomial.Polynomial(THRUST_BY_VOLTAGE)
+    return np.hstack([time, thrust(voltages)])

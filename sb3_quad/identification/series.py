@@ -5,25 +5,28 @@ from scipy.ndimage import uniform_filter1d
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, FloatArray
-from sb3_quad.base.validate import LARGEST
 
 # Longer gaps between rows are not filled, s
 LONGEST_GAP = 0.05
 
 
-def cleaned(name: str, table: FloatArray, notes: list[str]) -> FloatArray:
-    """Return a series without rows that are not finite, or are of the same time.
+def cleaned(name: str, table: FloatArray, largest: float, notes: list[str]) -> FloatArray:
+    """Return a series without rows that hold no numbers, or glitches, or are of the same time.
 
     :param name: of the series, for messages.
-    :param notes: gets a line on rows without numbers.
-    :raises ConfigError: hardly a row is left, times fall or are no seconds, numbers are too large.
+    :param largest: number that is no glitch.
+    :param notes: gets a line on rows that are skipped.
+    :raises ConfigError: hardly a row is left, times fall or are no seconds.
     """
-    rows = table[np.isfinite(table).all(axis=1)]
+    time, *columns = np.abs(table).T
+    known = np.isfinite(time) & (np.max(columns, axis=0) <= largest)
+    rows: FloatArray = table[known]
     missing = len(table) - len(rows)
+    unknown = f"no number up to {largest:g}"
     if len(rows) < max(2, missing):
-        raise ConfigError(f"{name}: {len(rows)} of {len(table)} rows hold numbers")
+        raise ConfigError(f"{name}: {missing} of {len(table)} rows hold {unknown}; check its unit")
     if missing:
-        notes.append(f"{name}: {missing} of {len(table)} rows hold no number, and are skipped")
+        notes.append(f"{name}: {missing} of {len(table)} rows hold {unknown}, and are skipped")
     time = rows[:, 0]
     steps = np.diff(time, prepend=-np.inf)
     if steps.min() < 0.0:
@@ -35,31 +38,31 @@ def cleaned(name: str, table: FloatArray, notes: list[str]) -> FloatArray:
             f"{name}: rows are {apart:.3g} s apart on average, where {LONGEST_GAP:g} s is "
             "the longest gap; is the time in the unit of its format?"
         )
-    largest = np.abs(rows[:, 1:]).max()
-    if largest > LARGEST:
-        raise ConfigError(f"{name}: {largest:.3g} is too large")
     return rows[steps > 0.0]
 
 
 def interpolated(series: FloatArray, grid: FloatArray) -> FloatArray:
     """Return values at the times of a grid, (n, columns)."""
     time, *columns = series.T
-    return np.stack([np.interp(grid, time, column) for column in columns], axis=1)
+    values = [np.interp(grid, time, column) for column in columns]
+    return np.array(values).T
 
 
 def averaged(series: FloatArray, step: float) -> FloatArray:
     """Return running means over about a step."""
     apart = np.median(np.diff(series[:, 0]))
-    samples = step // apart // 2 * 2 + 1
-    return np.asarray(uniform_filter1d(series, int(samples), axis=0))
+    half = int(step / apart / 2.0 + 1e-6)
+    means: FloatArray = uniform_filter1d(series, 2 * half + 1, axis=0)
+    return means
 
 
 def without_gaps(series: FloatArray, grid: FloatArray) -> BoolArray:
     """Whether each row of a grid lies between two samples that are close, (n,)."""
     time = series[:, 0]
     gaps = np.diff(time, prepend=-np.inf, append=np.inf)
-    after = np.searchsorted(time, grid, side="right")
-    return np.asarray(gaps[after] < LONGEST_GAP)
+    after = np.searchsorted(time, grid, "right")
+    near: BoolArray = gaps[after] < LONGEST_GAP
+    return near
 
 
 def means_of_steps(commands: FloatArray, begins: FloatArray, step: float) -> FloatArray:
@@ -67,9 +70,12 @@ def means_of_steps(commands: FloatArray, begins: FloatArray, step: float) -> Flo
 
     :param begins: of the steps, at regular times, (n,), s.
     """
-    lasting = np.diff(commands[:, :1], axis=0)
-    areas = np.zeros_like(commands)
-    areas[:, 0] = commands[:, 0]
-    areas[1:, 1:] = np.cumsum(lasting * commands[:-1, 1:], axis=0)
+    time, *columns = commands.T
+    held = np.diff(time)
     edges = np.append(begins, begins[-1] + step)
-    return np.asarray(np.diff(interpolated(areas, edges), axis=0) / step)
+    means = []
+    for column in columns:
+        areas = np.cumsum(held * column[:-1])
+        at_edges = np.interp(edges, time, np.append(0.0, areas))
+        means.append(np.diff(at_edges) / step)
+    return np.array(means).T

@@ -65,7 +65,7 @@ def run(options: Namespace) -> int:
     start = load_vehicle(options.vehicle or "crazyflie")
     for log in logs:
         for note in log.notes:
-            print(f"{log.path}: {note}", file=sys.stderr)
+            print(note, file=sys.stderr)
     fitted = logs if options.judge else split(logs)[0]
     # Vehicles are judged at their own control step.
     again = read_logs(options.judge or options.logs, start.control_step)
