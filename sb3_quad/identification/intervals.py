@@ -12,7 +12,7 @@ from sb3_quad.identification.prediction_error import Model, Optimum
 
 BLOCKS = 20
 # Half an interval, as a part of its value, beyond which the logs do not tell a parameter
-LARGEST_WIDTH = 0.7
+LARGEST_WIDTH = 1.0
 
 
 def jackknife(slopes: FloatArray, errors: FloatArray) -> FloatArray:
