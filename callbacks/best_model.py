@@ -19,14 +19,14 @@ from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.base.types import Report, StrDict, StrPath
 from sb3_quad.callbacks.every import EveryTimesteps, last_timestep
 
-# By logged name: an array of an evaluation, whose mean is logged; of final errors, the median.
-LOGGED = {
-    "success_rate": "successes",
-    "survival_rate": "survivals",
-    "mean_reward": "results",
-    "task_reward": "task_results",
-    "mean_ep_length": "ep_lengths",
-    "final_error": "final_errors",
+# By logged name: an array of an evaluation, and the statistic that is logged.
+LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    "success_rate": ("successes", np.mean),
+    "survival_rate": ("survivals", np.mean),
+    "mean_reward": ("results", np.mean),
+    "task_reward": ("task_results", np.mean),
+    "mean_ep_length": ("ep_lengths", np.mean),
+    "final_error": ("final_errors", np.nanmedian),
 }
 # The array of each rate that can decide, which is logged as "success_rate", for example.
 RATES = {"success": "successes", "survival": "survivals"}
@@ -186,11 +186,11 @@ class BestModel(EveryTimesteps):
             flown = fly_episodes(self.model, evaluations.env, self._n_episodes, self._seed)
             evaluations.append({**values, **flown})
             text = prefix
-            for name, array in LOGGED.items():
+            for name, (array, statistic) in LOGGED.items():
                 if array in flown:
-                    statistic: Any = np.nanmedian if name == "final_error" else np.mean
-                    value = float(statistic(flown[array]))
-                    self.logger.record(f"{evaluations.group}/{name}", value)
+                    self.logger.record(
+                        f"{evaluations.group}/{name}", float(statistic(flown[array]))
+                    )
             for name, array in RATES.items():
                 if array in flown:
                     text += f"{name} {100 * np.mean(flown[array]):.1f} %, "
