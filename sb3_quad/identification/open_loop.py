@@ -1,7 +1,6 @@
 """Recorded commands flown again from recorded states, and how far that is off."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import product
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -179,10 +178,11 @@ def error_table(logs: Sequence[Log], vehicles: Mapping[str, tuple[Vehicle, Curve
         columns.append(predicted)
     errors = np.stack([*columns, stays], axis=-1)
     rows = []
-    for (number, quantity), (k, horizon) in product(enumerate(QUANTITIES), enumerate(HORIZONS)):
-        # Without motion, body rates are all that is known.
-        if logs[0].has_motion or quantity.startswith("body rates"):
-            cells = [f"{value:.3g}" for value in errors[k, number]]
+    # Without motion, body rates are all that is known.
+    first = 0 if logs[0].has_motion else len(QUANTITIES) - 1
+    for number, quantity in enumerate(QUANTITIES[first:], first):
+        for horizon, values in zip(HORIZONS, errors[:, number], strict=True):
+            cells = [f"{value:.3g}" for value in values]
             rows.append([f"{quantity}, after {horizon:g} s", *cells])
     heads = ("root mean square of the error", *vehicles, "velocity, rates stay")
     return Table(heads, rows, f"{len(logs)} logs, open loop")

@@ -74,8 +74,8 @@ def read_recording(source: StrPath) -> Recording:
                 parts, headers = read(path, data)
                 return _recording(path, name, parts, headers)
         table, headers = _csv(path, data)
-        kinds = [name for name, mark in MARKS.items() if mark in table]
-        return _recording(path, [*kinds, "plain CSV"][0], [table], headers)
+        kinds = (name for name, mark in MARKS.items() if mark in table)
+        return _recording(path, next(kinds, "plain CSV"), [table], headers)
 
 
 def _recording(path: Path, name: str, parts: Sequence[Part], headers: StrDict) -> Recording:
