@@ -331,6 +331,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             actions = self._recorded_policy.forward(step, observations)
             if clones:
                 assert self._labeller is not None
+                # A tape may reuse its array, whose labels would be those of the step before.
                 self._labeller.look(observations, np.full(env.num_envs, step == 0))
                 self._differences.append(actions - self._labeller.labels(observations))
             if step % COMPARED == 0:
@@ -422,7 +423,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         _, lengths, is_lost = self._tape.episodes()
         lost = np.flatnonzero(is_lost)
         counts = np.arange(self.n_steps)[:, None] < lengths[lost]
-        pulls = np.array(self._differences)[:, lost] * counts[..., None]
+        pulls = np.array([step[lost] for step in self._differences]) * counts[..., None]
         self.logger.record("train/bc_loss", np.square(pulls).sum() / max(counts.sum(), 1))
         return pulls * np.float32(self.lost_bc_coef / (self.n_steps * len(lengths))), lost
 
