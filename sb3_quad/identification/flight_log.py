@@ -47,13 +47,11 @@ class Log:
         return means_of_steps(self.commands, self.times - delay, self.step)
 
     @cached_property
-    def mean_velocity(self) -> FloatArray:
-        """Mean velocity in the air, (3,), body axes, m/s."""
+    def airspeed(self) -> FloatArray:
+        """Velocity of the rows in the air, (rows, 3), body axes, m/s."""
         motion = self.motion[self.flying]
         to_body = attitudes(motion).inv()
-        velocity = to_body.apply(motion[:, VELOCITY])
-        mean: FloatArray = velocity.mean(axis=0)
-        return mean
+        return to_body.apply(motion[:, VELOCITY])
 
     def part(self, rows: slice) -> "Log":
         """Return a log with some rows that count alone."""

@@ -82,9 +82,7 @@ class Windows:
         batch.vehicles[:] = vehicle.parameters()[:, None]
         batch.reset()
         actions = vehicle.thrust_to_action(thrusts)
-        held = np.sqrt(np.clip(thrusts, *vehicle.thrust_range) / vehicle.lift)
-        gain = 0.5 * (vehicle.motor_gain_up + vehicle.motor_gain_down)
-        speeds = lagged(held, gain, vehicle.control_step)
+        speeds = rotor_speeds(vehicle, thrusts, vehicle.control_step)
         # Commands that still wait are given first.
         for now in range(-vehicle.delay, self.ends[-1]):
             if now == 0:
@@ -98,20 +96,30 @@ class Windows:
                 yield motion.T.copy(), state.specific_force
 
 
+def rotor_speeds(vehicle: Vehicle, thrusts: FloatArray, step: float) -> FloatArray:
+    """Return the rotor speeds that commanded thrusts, (n, 4), N, lead to, (n, 4), rad/s."""
+    held = np.sqrt(np.clip(thrusts, *vehicle.thrust_range) / vehicle.lift)
+    gain = 0.5 * (vehicle.motor_gain_up + vehicle.motor_gain_down)
+    return lagged(held, gain, step)
+
+
 def log_thrusts(
     logs: Sequence[Log], vehicle: Vehicle, curve: Curve, delay: float = 0.0
 ) -> FloatArray:
     """Return the commanded thrusts of all logs in the order of a vehicle's rotors, (n, 4), N.
 
-    The motors of each log are calibrated against each other, so that the mean moment of the
-    commands balances that of the air.
+    The motors of each log are calibrated against each other, so that the mean moment of the rotors
+    balances that of the air.
     """
     scaled = []
     arms = np.vstack([np.ones(4), vehicle.rotor_arms])
     for log in logs:
-        thrusts = curve.thrust(log.mean_commands(delay))[:, rotor_columns(log, vehicle)]
-        mean = thrusts[log.flying].mean(axis=0)
-        x, y, _ = log.mean_velocity * 4.0 * vehicle.hover_rotor_speed
+        commands = log.mean_commands(delay)[:, rotor_columns(log, vehicle)]
+        thrusts = curve.thrust(commands)
+        # Rotors that lag push with less than the mean of commands that change quickly.
+        speeds = rotor_speeds(vehicle, thrusts, log.step)[log.flying]
+        mean = vehicle.lift * np.square(speeds).mean(axis=0)
+        x, y, _ = speeds.sum(axis=1) @ log.airspeed / len(speeds)
         roll, pitch = vehicle.airspeed_moment
         wanted = np.linalg.solve(arms, [mean.sum(), -roll * y, pitch * x, 0.0])
         scaled.append(thrusts * wanted / mean)

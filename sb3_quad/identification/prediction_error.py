@@ -136,7 +136,7 @@ class Model:
         limits = self.table.loc[free, ["least", "most"]].to_numpy().T
         solution = least_squares(
             residuals,
-            np.clip(vector[free], *limits),
+            np.clip(vector[free], limits[0] + 0.1, limits[1]),
             slopes,
             limits,
             loss="soft_l1",
