@@ -23,7 +23,7 @@ from sb3_quad.identification import fit_vehicle, read_logs
 from sb3_quad.identification.alignment import mounting
 from sb3_quad.identification.curve import Curve, refuse_other_order
 from sb3_quad.identification.flight_log import attitudes, quaternions
-from sb3_quad.identification.open_loop import gaps, open_loop
+from sb3_quad.identification.open_loop import gaps, log_thrusts, open_loop
 from sb3_quad.identification.readers import THRUST_BY_VOLTAGE, motor_thrusts
 from sb3_quad.identification.smoothing import smoothed
 
@@ -292,6 +292,19 @@ def test_motors_in_another_order_are_refused_with_the_one_that_fits(table, tmp_p
     other = vehicle.model_copy(update={"rotor_directions": [1, -1, 1, -1]})
     with pytest.raises(ConfigError, match=r"yaw.*rotor_directions"):
         refuse_other_order([log], other, thrusts)
+
+
+def test_commands_that_a_rotor_cannot_follow_are_no_mean_moment(table, tmp_path):
+    vehicle = stepped(load_vehicle("crazyflie"))
+    calm = table.copy()
+    calm.loc[:, calm.columns != "t"] = [0.0, 0.0, 0.0, 0.0, 0.0, GRAVITY, 0.7, 0.7, 0.7, 0.7]
+    calm["share_1"] += 0.1 * (-1.0) ** calm.index.to_numpy()
+    write_plain(tmp_path / "log", calm)
+    (log,) = read_logs(tmp_path / "log")
+    curve = Curve("share", np.array([0.0, 0.0, vehicle.thrust_range[1]]))
+    commanded = curve.thrust(log.mean_commands())
+    thrusts = log_thrusts([log], vehicle, curve)
+    np.testing.assert_allclose(thrusts, commanded, rtol=0.002)
 
 
 @pytest.mark.slow

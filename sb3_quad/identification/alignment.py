@@ -20,7 +20,11 @@ WORTH_A_SHIFT = 0.998
 OFFSETS = np.append(0.0, np.arange(-0.1, 0.1005, 0.001))
 
 
-def recorded_attitudes(path: Path, series: FloatArray, grid: FloatArray) -> Rotation:
+def recorded_attitudes(
+    path: Path,
+    series: FloatArray,
+    grid: FloatArray,
+) -> Rotation:
     """Return the attitudes at the times of a grid.
 
     :param series: times, s, and quaternions (w, x, y, z), (samples, 5).
@@ -32,13 +36,17 @@ def recorded_attitudes(path: Path, series: FloatArray, grid: FloatArray) -> Rota
     norm = norms[worst]
     if not 0.9 < norm < 1.1:
         raise ConfigError(f"{path}: row {worst + 1}: qw, qx, qy, qz have length {norm:.3g}")
-    recorded = Rotation.from_quat(series[:, [2, 3, 4, 1]])
+    recorded = Rotation.from_quat(series[:, 1:], scalar_first=True)
     between = Slerp(time, recorded)
     return between(grid)
 
 
 def clock_offset(
-    path: Path, gyro: FloatArray, attitude: Rotation, grid: FloatArray, flying: BoolArray
+    path: Path,
+    gyro: FloatArray,
+    attitude: Rotation,
+    grid: FloatArray,
+    flying: BoolArray,
 ) -> float:
     """Return how far the gyro's clock is behind that of the attitude, s.
 
@@ -59,7 +67,11 @@ def clock_offset(
     return float(OFFSETS[best])
 
 
-def mounting(attitude: Rotation, velocity: FloatArray, force: FloatArray) -> Rotation:
+def mounting(
+    attitude: Rotation,
+    velocity: FloatArray,
+    force: FloatArray,
+) -> Rotation:
     """Return the rotation from the vehicle to its markers.
 
     :param attitude: of the markers, n.

@@ -7,6 +7,7 @@ the rotors.
 
 from collections.abc import Callable, Sequence
 from itertools import product
+from operator import itemgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +51,10 @@ class Fit(NamedTuple):
 
 
 def fit_vehicle(
-    logs: Sequence[Log], start: Vehicle, name: str = "fitted", show: Show | None = None
+    logs: Sequence[Log],
+    start: Vehicle,
+    name: str = "fitted",
+    show: Show | None = None,
 ) -> Fit:
     """Fit a vehicle to logs.
 
@@ -103,16 +107,19 @@ def fit_vehicle(
     return Fit(_with_limits(fitted, name, steps, has_lag), fitted.curve, table)
 
 
-def _with_intervals(model: Model, optimum: Optimum, values: FloatArray) -> pd.DataFrame:
+def _with_intervals(
+    model: Model,
+    optimum: Optimum,
+    values: FloatArray,
+) -> pd.DataFrame:
     """Return the table of a model with values and the widths of those that are fitted."""
     free = model.free()
-    widths = jackknife(optimum.slopes, optimum.errors)
+    widths = jackknife(optimum.slopes, optimum.errors) * model.scale[free]
     table = model.table
     least = LEAST_WIDTH * np.maximum(np.abs(values), table["size"])
     least = least.where(table["field"] != "delay", LEAST_DELAY_WIDTH)
     table["value"] = values
-    table["width"] = np.nan
-    table.loc[free, "width"] = widths * model.scale[free]
+    table["width"] = pd.Series(widths, free)
     table["width"] = table["width"].clip(least)
     return table
 
@@ -126,11 +133,11 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
     gains = 1.0 / LAGS
     if kind == "rotor_speed":
         gains = np.array([FASTEST])
-    pairs = [*product(gains.tolist(), DELAYS.tolist())]
-    curves = [regress(logs, start, *pair) for pair in pairs]
-    best = int(np.argmin([rest for _, rest in curves]))
-    curve, _ = curves[best]
-    gain, delay = pairs[best]
+    tried = []
+    for gain, delay in product(gains.tolist(), DELAYS.tolist()):
+        curve, rest = regress(logs, start, gain, delay)
+        tried.append((rest, gain, delay, curve))
+    _, gain, delay, curve = min(tried, key=itemgetter(0))
     refuse_other_order(logs, start, log_thrusts(logs, start, curve, delay))
     strongest = max(curve.thrust(log.mean_commands()).max() for log in logs)
     step = logs[0].step
@@ -151,7 +158,12 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
     return Guess(start.model_copy(update=changes), curve, delay)
 
 
-def _with_limits(fitted: Guess, name: str, delay: int, has_lag: bool) -> Vehicle:
+def _with_limits(
+    fitted: Guess,
+    name: str,
+    delay: int,
+    has_lag: bool,
+) -> Vehicle:
     """Return a fitted vehicle with the limits of its commands.
 
     :param delay: in whole control steps.
@@ -159,13 +171,21 @@ def _with_limits(fitted: Guess, name: str, delay: int, has_lag: bool) -> Vehicle
     :raises ConfigError: it does not hover.
     """
     vehicle = fitted.vehicle
-    changes: StrDict = {"name": name, "motor_integration": "exact", "delay": delay}
+    changes: StrDict = {
+        "name": name,
+        "motor_integration": "exact",
+        "delay": delay,
+    }
     if has_lag:
         lag = 1.0 / vehicle.motor_gain_up + fitted.delay - delay * vehicle.control_step
         changes["motor_gain"] = 1.0 / max(lag, 1.0 / FASTEST)
     low, most = vehicle.thrust_range
     _, fastest = vehicle.rotor_speed_range
-    full = {"thrust": most, "share": 1.0, "rotor_speed": fastest}
+    full = {
+        "thrust": most,
+        "share": 1.0,
+        "rotor_speed": fastest,
+    }
     high = fitted.curve.thrust(np.array(full[fitted.curve.kind]))
     if not 1.05 < high / vehicle.hover_thrust < MOST_THRUST:
         raise ConfigError(

@@ -62,14 +62,12 @@ class Log:
 
 def attitudes(motion: FloatArray) -> Rotation:
     """Return the rotations from body to world of motions, (n, 13)."""
-    w, *xyz = motion[:, QUATERNION].T
-    return Rotation.from_quat(np.array([*xyz, w]).T)
+    return Rotation.from_quat(motion[:, QUATERNION], scalar_first=True)
 
 
 def quaternions(rotations: Rotation) -> FloatArray:
     """Return the quaternions (w, x, y, z) of rotations, (n, 4)."""
-    xyzw = rotations.as_quat(canonical=True)
-    return np.roll(xyzw, 1, axis=1)
+    return rotations.as_quat(canonical=True, scalar_first=True)
 
 
 def rotor_columns(log: Log, vehicle: Vehicle) -> list[int]:

@@ -28,8 +28,8 @@ from sb3_quad.identification.flight_log import (
 )
 
 HORIZONS = (0.1, 0.2, 0.5)  # s
-# Time before a window whose commands spin up the rotors, s
-WARM_UP = 0.25
+# Time before a window whose commands spin up the rotors, s; how they turn at first is unknown
+WARM_UP = 0.5
 QUANTITIES = ("position, m", "velocity, m/s", "attitude, °", "body rates, rad/s")
 ATTITUDE = 2
 
@@ -68,9 +68,18 @@ class Windows:
         # The compiled step leaves out the air's moments, unless a vehicle has some.
         in_air = vehicle.model_copy(update={"rate_damping": [1e-12] * 3})
         settings = FlightSettings(vehicle=in_air, noise=0.0)
-        self.batch = QuadcopterBatch(self.rows.size, settings, seed=0, autoreset=False)
+        self.batch = QuadcopterBatch(
+            self.rows.size,
+            settings,
+            seed=0,
+            autoreset=False,
+        )
 
-    def fly(self, vehicle: Vehicle, thrusts: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
+    def fly(
+        self,
+        vehicle: Vehicle,
+        thrusts: FloatArray,
+    ) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Fly all windows.
 
         :param vehicle: with the control step and delay of the one that the windows were made for.
@@ -96,7 +105,11 @@ class Windows:
                 yield motion.T.copy(), state.specific_force
 
 
-def rotor_speeds(vehicle: Vehicle, thrusts: FloatArray, step: float) -> FloatArray:
+def rotor_speeds(
+    vehicle: Vehicle,
+    thrusts: FloatArray,
+    step: float,
+) -> FloatArray:
     """Return the rotor speeds that commanded thrusts, (n, 4), N, lead to, (n, 4), rad/s."""
     held = np.sqrt(np.clip(thrusts, *vehicle.thrust_range) / vehicle.lift)
     gain = 0.5 * (vehicle.motor_gain_up + vehicle.motor_gain_down)
@@ -104,7 +117,10 @@ def rotor_speeds(vehicle: Vehicle, thrusts: FloatArray, step: float) -> FloatArr
 
 
 def log_thrusts(
-    logs: Sequence[Log], vehicle: Vehicle, curve: Curve, delay: float = 0.0
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    curve: Curve,
+    delay: float = 0.0,
 ) -> FloatArray:
     """Return the commanded thrusts of all logs in the order of a vehicle's rotors, (n, 4), N.
 
@@ -121,7 +137,13 @@ def log_thrusts(
         mean = vehicle.lift * np.square(speeds).mean(axis=0)
         x, y, _ = speeds.sum(axis=1) @ log.airspeed / len(speeds)
         roll, pitch = vehicle.airspeed_moment
-        wanted = np.linalg.solve(arms, [mean.sum(), -roll * y, pitch * x, 0.0])
+        wrench = [
+            mean.sum(),
+            -roll * y,
+            pitch * x,
+            0.0,
+        ]
+        wanted = np.linalg.solve(arms, wrench)
         scaled.append(thrusts * wanted / mean)
     return np.concatenate(scaled)
 
@@ -138,7 +160,11 @@ def gaps(motion: FloatArray, record: FloatArray) -> list[FloatArray]:
     return [position, velocity, turned.as_rotvec(), rates]
 
 
-def open_loop(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> FloatArray:
+def open_loop(
+    logs: Sequence[Log],
+    vehicle: Vehicle,
+    curve: Curve,
+) -> FloatArray:
     """Fly recorded commands from recorded states.
 
     Each row from which a log flies on for long enough begins a window. Its rotors begin with the
@@ -173,7 +199,10 @@ def open_loop(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> FloatArray
     return typical
 
 
-def error_table(logs: Sequence[Log], vehicles: Mapping[str, tuple[Vehicle, Curve | None]]) -> Table:
+def error_table(
+    logs: Sequence[Log],
+    vehicles: Mapping[str, tuple[Vehicle, Curve | None]],
+) -> Table:
     """Return the errors of vehicles in open loop, over all windows of all logs.
 
     :param vehicles: by the heading of their column, with the thrust of a motor over its command, or
@@ -192,5 +221,8 @@ def error_table(logs: Sequence[Log], vehicles: Mapping[str, tuple[Vehicle, Curve
         for horizon, values in zip(HORIZONS, errors[:, number], strict=True):
             cells = [f"{value:.3g}" for value in values]
             rows.append([f"{quantity}, after {horizon:g} s", *cells])
-    heads = ("root mean square of the error", *vehicles, "velocity, rates stay")
-    return Table(heads, rows, f"{len(logs)} logs, open loop")
+    return Table(
+        ("root mean square of the error", *vehicles, "velocity, rates stay"),
+        rows,
+        f"{len(logs)} logs, open loop",
+    )

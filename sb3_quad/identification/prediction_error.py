@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
+from scipy.optimize import approx_fprime, least_squares
 from scipy.signal import detrend
 
 from sb3_quad.base.types import FloatArray, IntArray
@@ -24,6 +24,8 @@ MOST_WINDOWS = 750
 ERRORS = (0.1, 0.4, 0.15, 0.4, 2.0)
 RATES = 3
 DIFFERENCE = 2e-3
+# How far above its lower limit an element begins
+INSIDE = 0.1
 
 
 class Optimum(NamedTuple):
@@ -44,7 +46,12 @@ class Model:
     :param horizons: where predictions are compared, s.
     """
 
-    def __init__(self, logs: Sequence[Log], start: Guess, horizons: FloatArray) -> None:
+    def __init__(
+        self,
+        logs: Sequence[Log],
+        start: Guess,
+        horizons: FloatArray,
+    ) -> None:
         self.logs = logs
         self.start = start
         self.table = parameters_of(logs, start)
@@ -84,7 +91,12 @@ class Model:
         """
         guess = self.guess(vector)
         windows = self.windows
-        thrusts = log_thrusts(self.logs, guess.vehicle, guess.curve, guess.delay)
+        thrusts = log_thrusts(
+            self.logs,
+            guess.vehicle,
+            guess.curve,
+            guess.delay,
+        )
         flown = windows.fly(guess.vehicle, thrusts)
         errors = []
         for end, (motion, force) in zip(windows.ends, flown, strict=True):
@@ -127,17 +139,13 @@ class Model:
             fitted[free] = values
             return self.residuals(fitted).ravel()
 
-        def slopes(values: FloatArray) -> FloatArray:
-            here = residuals(values)
-            steps = DIFFERENCE * np.eye(len(free))
-            changes = [residuals(values + step) - here for step in steps]
-            return np.array(changes).T / DIFFERENCE
-
         limits = self.table.loc[free, ["least", "most"]].to_numpy().T
+        # A search that begins at a limit hardly leaves it.
+        begin = np.clip(vector[free], limits[0] + INSIDE, limits[1])
         solution = least_squares(
             residuals,
-            np.clip(vector[free], limits[0] + 0.1, limits[1]),
-            slopes,
+            begin,
+            lambda values: approx_fprime(values, residuals, DIFFERENCE),
             limits,
             loss="soft_l1",
             max_nfev=evaluations,

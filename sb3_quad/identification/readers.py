@@ -162,34 +162,33 @@ def _usd(_path: Path, data: bytes) -> tuple[list[Part], StrDict]:
     # Version 1 counts milliseconds, version 2 microseconds.
     time, scale = {1: ("<I", 1.0), 2: ("<Q", 1e-3)}[version]
     place = 5
-    layouts: dict[int, struct.Struct] = {}
-    names: dict[int, list[str]] = {}
+    # For each kind: how a row is packed, the names of its columns, and the rows
+    tables: dict[int, tuple[struct.Struct, list[str], list[Any]]] = {}
     for _ in range(kinds):
         (kind,) = struct.unpack_from("<H", data, place)
         place = data.index(b"\0", place + 2) + 1
         (count,) = struct.unpack_from("<H", data, place)
         place += 2
-        names[kind] = ["timestamp"]
+        names = ["timestamp"]
         letters = time
         for _ in range(count):
             end = data.index(b"\0", place, place + LONGEST_NAME)
             name, letter = data[place:end].decode().split("(")
-            names[kind].append(name)
+            names.append(name)
             # Its types are those of Python's struct.
             letters += letter[0]
             place = end + 1
-        layouts[kind] = struct.Struct(letters)
-    rows: dict[int, list[Any]] = {kind: [] for kind in layouts}
+        tables[kind] = struct.Struct(letters), names, []
     # The last four bytes are a checksum; a log that was cut ends anywhere.
     with suppress(struct.error, KeyError):
         while True:
             (kind,) = struct.unpack_from("<H", data, place)
-            layout = layouts[kind]
-            rows[kind].append(layout.unpack_from(data, place + 2))
+            layout, _, rows = tables[kind]
+            rows.append(layout.unpack_from(data, place + 2))
             place += 2 + layout.size
     parts: list[Part] = []
-    for kind, values in rows.items():
-        table = pd.DataFrame(values, columns=names[kind], dtype=float)
+    for _, names, rows in tables.values():
+        table = pd.DataFrame(rows, columns=names, dtype=float)
         table["timestamp"] *= scale
         parts.append(dict(table))
     return parts, {}

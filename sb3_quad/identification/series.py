@@ -10,7 +10,12 @@ from sb3_quad.base.types import BoolArray, FloatArray
 LONGEST_GAP = 0.05
 
 
-def cleaned(name: str, table: FloatArray, largest: float, notes: list[str]) -> FloatArray:
+def cleaned(
+    name: str,
+    table: FloatArray,
+    largest: float,
+    notes: list[str],
+) -> FloatArray:
     """Return a series without rows that hold no numbers, or glitches, or are of the same time.
 
     :param name: of the series, for messages.
@@ -65,17 +70,18 @@ def without_gaps(series: FloatArray, grid: FloatArray) -> BoolArray:
     return near
 
 
-def means_of_steps(commands: FloatArray, begins: FloatArray, step: float) -> FloatArray:
+def means_of_steps(
+    commands: FloatArray,
+    begins: FloatArray,
+    step: float,
+) -> FloatArray:
     """Return the mean of each step of commands that are held until the next one, (n, columns).
 
     :param begins: of the steps, at regular times, (n,), s.
     """
-    time, *columns = commands.T
-    held = np.diff(time)
+    held = np.diff(commands[:, :1], axis=0)
+    areas = commands.copy()
+    areas[0, 1:] = 0.0
+    areas[1:, 1:] = np.cumsum(held * commands[:-1, 1:], axis=0)
     edges = np.append(begins, begins[-1] + step)
-    means = []
-    for column in columns:
-        areas = np.cumsum(held * column[:-1])
-        at_edges = np.interp(edges, time, np.append(0.0, areas))
-        means.append(np.diff(at_edges) / step)
-    return np.array(means).T
+    return np.diff(interpolated(areas, edges), axis=0) / step
