@@ -304,7 +304,7 @@ def test_commands_that_a_rotor_cannot_follow_are_no_mean_moment(table, tmp_path)
     curve = Curve("share", np.array([0.0, 0.0, vehicle.thrust_range[1]]))
     commanded = curve.thrust(log.mean_commands())
     thrusts = log_thrusts([log], vehicle, curve)
-    np.testing.assert_allclose(thrusts, commanded, rtol=0.002)
+    np.testing.assert_allclose(thrusts, commanded, rtol=0.004)
 
 
 @pytest.mark.slow
