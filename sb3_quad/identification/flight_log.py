@@ -51,7 +51,8 @@ class Log:
         """Velocity of the rows in the air, (rows, 3), body axes, m/s."""
         motion = self.motion[self.flying]
         to_body = attitudes(motion).inv()
-        return to_body.apply(motion[:, VELOCITY])
+        velocity: FloatArray = to_body.apply(motion[:, VELOCITY])
+        return velocity
 
     def part(self, rows: slice) -> "Log":
         """Return a log with some rows that count alone."""
@@ -67,7 +68,8 @@ def attitudes(motion: FloatArray) -> Rotation:
 
 def quaternions(rotations: Rotation) -> FloatArray:
     """Return the quaternions (w, x, y, z) of rotations, (n, 4)."""
-    return rotations.as_quat(canonical=True, scalar_first=True)
+    wxyz: FloatArray = rotations.as_quat(canonical=True, scalar_first=True)
+    return wxyz
 
 
 def rotor_columns(log: Log, vehicle: Vehicle) -> list[int]:
