@@ -19,7 +19,7 @@ from sb3_quad.envs.vehicles.vehicle import MAX_PHYSICS_STEP, Vehicle
 from sb3_quad.identification.curve import Curve, refuse_other_order, regress
 from sb3_quad.identification.flight_log import Log
 from sb3_quad.identification.intervals import jackknife, not_told
-from sb3_quad.identification.open_loop import log_thrusts
+from sb3_quad.identification.open_loop import WARM_UP, log_thrusts
 from sb3_quad.identification.parameters import FASTEST, Guess
 from sb3_quad.identification.prediction_error import Model, Optimum
 
@@ -65,6 +65,8 @@ def fit_vehicle(
     :param show: called with what is done, the total, and what is being done.
     :raises ConfigError: the logs contradict the start, or do not fly for long enough.
     """
+    # How the rotors turn where a log begins is unknown.
+    logs = [log.part(slice(round(WARM_UP / log.step), None)) for log in logs]
     report = show or (lambda done, total, text: None)
     report(0, 3, "regressions")
     guess = first_guess(logs, start)

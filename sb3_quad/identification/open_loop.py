@@ -40,7 +40,6 @@ class Windows:
     :param logs: with rows at the vehicle's control step.
     :param ends: control steps from the begin of a window to where it is compared, rising.
     :param stride: rows from one window to the next.
-    :param warm_up: time before a window whose commands spin up the rotors, s.
     :raises ConfigError: no log flies for long enough.
     """
 
@@ -50,10 +49,9 @@ class Windows:
         vehicle: Vehicle,
         ends: Sequence[int],
         stride: int = 1,
-        warm_up: float = WARM_UP,
     ) -> None:
         self.ends = ends
-        before = round(warm_up / vehicle.control_step) + vehicle.delay
+        before = round(WARM_UP / vehicle.control_step) + vehicle.delay
         length = before + ends[-1] + 1
         # A window is valid only if all of its rows fly, and are of one log.
         flying = np.concatenate([np.append(log.flying[:-1], False) for log in logs])

@@ -19,8 +19,6 @@ from sb3_quad.identification.smoothing import smoothed
 # Windows overlap; nearer ones, s, hardly tell more.
 APART = 0.16
 MOST_WINDOWS = 750
-# Before a window, s; how the rotors turn where a log begins is unknown.
-WARM_UP = 0.5
 # Of position, velocity, attitude, body rates and specific force, in the units of the motion: errors
 # of this size count as one in the first fit.
 ERRORS = (0.1, 0.4, 0.15, 0.4, 2.0)
@@ -66,7 +64,7 @@ class Model:
         if self.has_motion:
             flying = sum(log.flying.sum() for log in logs)
             stride = max(round(APART / step), flying // MOST_WINDOWS)
-        self.windows = Windows(logs, start.vehicle, ends, stride, WARM_UP)
+        self.windows = Windows(logs, start.vehicle, ends, stride)
         if self.has_motion:
             # The noise of where a window begins would grow with some parameters, and bias them.
             motion = np.concatenate([smoothed(log) for log in logs])
