@@ -20,11 +20,7 @@ WORTH_A_SHIFT = 0.998
 OFFSETS = np.append(0.0, np.arange(-0.1, 0.1005, 0.001))
 
 
-def recorded_attitudes(
-    path: Path,
-    series: FloatArray,
-    grid: FloatArray,
-) -> Rotation:
+def recorded_attitudes(path: Path, series: FloatArray, grid: FloatArray) -> Rotation:
     """Return the attitudes at the times of a grid.
 
     :param series: times, s, and quaternions (w, x, y, z), (samples, 5).
@@ -42,11 +38,7 @@ def recorded_attitudes(
 
 
 def clock_offset(
-    path: Path,
-    gyro: FloatArray,
-    attitude: Rotation,
-    grid: FloatArray,
-    flying: BoolArray,
+    path: Path, gyro: FloatArray, attitude: Rotation, grid: FloatArray, flying: BoolArray
 ) -> float:
     """Return how far the gyro's clock is behind that of the attitude, s.
 
@@ -67,11 +59,7 @@ def clock_offset(
     return float(OFFSETS[best])
 
 
-def mounting(
-    attitude: Rotation,
-    velocity: FloatArray,
-    force: FloatArray,
-) -> Rotation:
+def mounting(attitude: Rotation, velocity: FloatArray, force: FloatArray) -> Rotation:
     """Return the rotation from the vehicle to its markers.
 
     :param attitude: of the markers, n.

@@ -14,11 +14,7 @@ from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.identification.flight_log import Log
 
 # The powers of a command that its thrust consists of, by the kind of the command
-POWERS = {
-    "thrust": (1,),
-    "rotor_speed": (2,),
-    "share": (0, 1, 2),
-}
+POWERS = {"thrust": (1,), "rotor_speed": (2,), "share": (0, 1, 2)}
 # The sum of three correlations that speaks for another order
 LEAST_BETTER = 0.25
 
@@ -46,13 +42,7 @@ def lagged(values: FloatArray, gain: float, step: float) -> FloatArray:
     kept = np.exp(-gain * step)
     begin = kept * values[:1]
     response: FloatArray
-    response, _ = lfilter(
-        [1.0 - kept],
-        [1.0, -kept],
-        values,
-        axis=0,
-        zi=begin,
-    )
+    response, _ = lfilter([1.0 - kept], [1.0, -kept], values, axis=0, zi=begin)
     return response
 
 
@@ -69,10 +59,7 @@ def fit_curve(logs: Sequence[Log], vehicle: Vehicle) -> Curve:
 
 
 def regress(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    gain: float,
-    delay: float,
+    logs: Sequence[Log], vehicle: Vehicle, gain: float, delay: float
 ) -> tuple[Curve, float]:
     """Fit the curve for motors with a lag and a delay to the specific force along z (least squares
     over all flights).
@@ -97,11 +84,7 @@ def regress(
     return Curve(kind, coefficients), float(np.std(right - left @ coefficients))
 
 
-def refuse_other_order(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    thrusts: FloatArray,
-) -> None:
+def refuse_other_order(logs: Sequence[Log], vehicle: Vehicle, thrusts: FloatArray) -> None:
     """Refuse logs that turn as with rotors in another order, or props that turn the other way.
 
     In a calm flight, the controller's answer to a turn hides what the motors do, so the liveliest
@@ -129,11 +112,7 @@ def refuse_other_order(
     )
 
 
-def _agreement(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    thrusts: FloatArray,
-) -> FloatArray:
+def _agreement(logs: Sequence[Log], vehicle: Vehicle, thrusts: FloatArray) -> FloatArray:
     """Return the correlation of body accelerations with moments about each axis, (3,), for that lag
     up to 0.1 s where it is largest; 0 where nothing changes.
     """

@@ -51,10 +51,7 @@ class Fit(NamedTuple):
 
 
 def fit_vehicle(
-    logs: Sequence[Log],
-    start: Vehicle,
-    name: str = "fitted",
-    show: Show | None = None,
+    logs: Sequence[Log], start: Vehicle, name: str = "fitted", show: Show | None = None
 ) -> Fit:
     """Fit a vehicle to logs.
 
@@ -109,11 +106,7 @@ def fit_vehicle(
     return Fit(_with_limits(fitted, name, steps, has_lag), fitted.curve, table)
 
 
-def _with_intervals(
-    model: Model,
-    optimum: Optimum,
-    values: FloatArray,
-) -> pd.DataFrame:
+def _with_intervals(model: Model, optimum: Optimum, values: FloatArray) -> pd.DataFrame:
     """Return the table of a model with values and the widths of those that are fitted."""
     free = model.free()
     widths = jackknife(optimum.slopes, optimum.errors) * model.scale[free]
@@ -160,12 +153,7 @@ def first_guess(logs: Sequence[Log], start: Vehicle) -> Guess:
     return Guess(start.model_copy(update=changes), curve, delay)
 
 
-def _with_limits(
-    fitted: Guess,
-    name: str,
-    delay: int,
-    has_lag: bool,
-) -> Vehicle:
+def _with_limits(fitted: Guess, name: str, delay: int, has_lag: bool) -> Vehicle:
     """Return a fitted vehicle with the limits of its commands.
 
     :param delay: in whole control steps.
@@ -173,21 +161,13 @@ def _with_limits(
     :raises ConfigError: it does not hover.
     """
     vehicle = fitted.vehicle
-    changes: StrDict = {
-        "name": name,
-        "motor_integration": "exact",
-        "delay": delay,
-    }
+    changes: StrDict = {"name": name, "motor_integration": "exact", "delay": delay}
     if has_lag:
         lag = 1.0 / vehicle.motor_gain_up + fitted.delay - delay * vehicle.control_step
         changes["motor_gain"] = 1.0 / max(lag, 1.0 / FASTEST)
     low, most = vehicle.thrust_range
     _, fastest = vehicle.rotor_speed_range
-    full = {
-        "thrust": most,
-        "share": 1.0,
-        "rotor_speed": fastest,
-    }
+    full = {"thrust": most, "share": 1.0, "rotor_speed": fastest}
     high = fitted.curve.thrust(np.array(full[fitted.curve.kind]))
     if not 1.05 < high / vehicle.hover_thrust < MOST_THRUST:
         raise ConfigError(

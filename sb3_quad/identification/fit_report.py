@@ -59,11 +59,7 @@ def write_vehicle(path: StrPath, fit: Fit, logs: Sequence[Log]) -> None:
     comments = f"Fitted by sb3-quad fit to {seconds:.0f} s of {names}.\n{table}\n"
     content = fit.vehicle.model_dump_json(exclude_defaults=True)
     short = json.loads(content, parse_float=_short)
-    text = yaml.safe_dump(
-        short,
-        sort_keys=False,
-        default_flow_style=None,
-    )
+    text = yaml.safe_dump(short, sort_keys=False, default_flow_style=None)
     write_text(path, indent(comments, "# ") + text)
 
 
@@ -89,37 +85,16 @@ def prediction_plot(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> Figu
     rows = windows.rows[shown] + np.arange(count + 1)[:, None]
     recorded = np.arange(first, rows.max())
     panels = PANELS if log.has_motion else PANELS[:1]
-    figure = Figure(
-        figsize=(3 * WIDTH, HEIGHT * len(panels)),
-        layout="constrained",
-    )
-    all_axes = figure.subplots(
-        len(panels),
-        3,
-        squeeze=False,
-        sharex=True,
-    )
+    figure = Figure(figsize=(3 * WIDTH, HEIGHT * len(panels)), layout="constrained")
+    all_axes = figure.subplots(len(panels), 3, squeeze=False, sharex=True)
     for line, (name, unit, part) in zip(all_axes, panels, strict=True):
         for k, axes in enumerate(line, part.start):
             measured = log.motion[recorded, k]
-            axes.plot(
-                step * recorded,
-                measured,
-                "k",
-                label="measured",
-            )
+            axes.plot(step * recorded, measured, "k", label="measured")
             flight = predicted[:, shown, k]
-            axes.plot(
-                step * rows,
-                flight,
-                color=COLOURS[1],
-                label="predicted",
-            )
+            axes.plot(step * rows, flight, color=COLOURS[1], label="predicted")
             axis = "xyz"[k - part.start]
-            axes.set(
-                ylabel=f"{name} {axis} ({unit})",
-                xlabel="time (s)",
-            )
+            axes.set(ylabel=f"{name} {axis} ({unit})", xlabel="time (s)")
     legend(figure)
     return figure
 

@@ -9,12 +9,7 @@ from scipy.signal import savgol_filter
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, FloatArray, StrPath
 from sb3_quad.base.validate import LARGEST
-from sb3_quad.envs.simulation.state import (
-    BODY_RATES,
-    POSITION,
-    QUATERNION,
-    VELOCITY,
-)
+from sb3_quad.envs.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from sb3_quad.identification.alignment import clock_offset, mounting, recorded_attitudes
 from sb3_quad.identification.flight_log import MOTION_SIZE, UPWARD, Log, quaternions
 from sb3_quad.identification.plausible import (
@@ -166,14 +161,7 @@ def _fill_motion(
     attitude = recorded_attitudes(path, series["attitude"], grid)
     offset = clock_offset(path, gyro, attitude, grid, flying)
     rows = round(SMOOTHED / step) // 2 * 2 + 1
-    acceleration = savgol_filter(
-        velocity,
-        rows,
-        2,
-        deriv=1,
-        delta=step,
-        axis=0,
-    )
+    acceleration = savgol_filter(velocity, rows, 2, deriv=1, delta=step, axis=0)
     force = UPWARD + acceleration
     if flying.any():
         attitude *= mounting(attitude[flying], velocity[flying], force[flying])

@@ -9,13 +9,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import FloatArray
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.settings import FlightSettings
-from sb3_quad.envs.simulation.state import (
-    BODY_RATES,
-    POSITION,
-    QUATERNION,
-    ROTOR_SPEEDS,
-    VELOCITY,
-)
+from sb3_quad.envs.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, VELOCITY
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 from sb3_quad.evaluation.tables import Table
 from sb3_quad.identification.curve import Curve, fit_curve, lagged
@@ -44,11 +38,7 @@ class Windows:
     """
 
     def __init__(
-        self,
-        logs: Sequence[Log],
-        vehicle: Vehicle,
-        ends: Sequence[int],
-        stride: int = 1,
+        self, logs: Sequence[Log], vehicle: Vehicle, ends: Sequence[int], stride: int = 1
     ) -> None:
         self.ends = ends
         before = round(WARM_UP / vehicle.control_step) + vehicle.delay
@@ -68,18 +58,9 @@ class Windows:
         # The compiled step leaves out the air's moments, unless a vehicle has some.
         in_air = vehicle.model_copy(update={"rate_damping": [1e-12] * 3})
         settings = FlightSettings(vehicle=in_air, noise=0.0)
-        self.batch = QuadcopterBatch(
-            self.rows.size,
-            settings,
-            seed=0,
-            autoreset=False,
-        )
+        self.batch = QuadcopterBatch(self.rows.size, settings, seed=0, autoreset=False)
 
-    def fly(
-        self,
-        vehicle: Vehicle,
-        thrusts: FloatArray,
-    ) -> Iterator[tuple[FloatArray, FloatArray]]:
+    def fly(self, vehicle: Vehicle, thrusts: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
         """Fly all windows.
 
         :param vehicle: with the control step and delay of the one that the windows were made for.
@@ -105,11 +86,7 @@ class Windows:
                 yield motion.T.copy(), state.specific_force
 
 
-def rotor_speeds(
-    vehicle: Vehicle,
-    thrusts: FloatArray,
-    step: float,
-) -> FloatArray:
+def rotor_speeds(vehicle: Vehicle, thrusts: FloatArray, step: float) -> FloatArray:
     """Return the rotor speeds that commanded thrusts, (n, 4), N, lead to, (n, 4), rad/s."""
     held = np.sqrt(np.clip(thrusts, *vehicle.thrust_range) / vehicle.lift)
     gain = 0.5 * (vehicle.motor_gain_up + vehicle.motor_gain_down)
@@ -117,10 +94,7 @@ def rotor_speeds(
 
 
 def log_thrusts(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    curve: Curve,
-    delay: float = 0.0,
+    logs: Sequence[Log], vehicle: Vehicle, curve: Curve, delay: float = 0.0
 ) -> FloatArray:
     """Return the commanded thrusts of all logs in the order of a vehicle's rotors, (n, 4), N.
 
@@ -137,12 +111,7 @@ def log_thrusts(
         mean = vehicle.lift * np.square(speeds).mean(axis=0)
         x, y, _ = speeds.sum(axis=1) @ log.airspeed / len(speeds)
         roll, pitch = vehicle.airspeed_moment
-        wrench = [
-            mean.sum(),
-            -roll * y,
-            pitch * x,
-            0.0,
-        ]
+        wrench = [mean.sum(), -roll * y, pitch * x, 0.0]
         wanted = np.linalg.solve(arms, wrench)
         scaled.append(thrusts * wanted / mean)
     return np.concatenate(scaled)
@@ -160,11 +129,7 @@ def gaps(motion: FloatArray, record: FloatArray) -> list[FloatArray]:
     return [position, velocity, turned.as_rotvec(), rates]
 
 
-def open_loop(
-    logs: Sequence[Log],
-    vehicle: Vehicle,
-    curve: Curve,
-) -> FloatArray:
+def open_loop(logs: Sequence[Log], vehicle: Vehicle, curve: Curve) -> FloatArray:
     """Fly recorded commands from recorded states.
 
     Each row from which a log flies on for long enough begins a window. Its rotors begin with the
@@ -199,10 +164,7 @@ def open_loop(
     return typical
 
 
-def error_table(
-    logs: Sequence[Log],
-    vehicles: Mapping[str, tuple[Vehicle, Curve | None]],
-) -> Table:
+def error_table(logs: Sequence[Log], vehicles: Mapping[str, tuple[Vehicle, Curve | None]]) -> Table:
     """Return the errors of vehicles in open loop, over all windows of all logs.
 
     :param vehicles: by the heading of their column, with the thrust of a motor over its command, or

@@ -24,22 +24,14 @@ LEAST_MOTION = 0.2
 LEAST_AGREEMENT = 0.1
 AVERAGED = 0.1  # s
 # Mean commands in flight: N, rad/s, and a part of the full command
-LIKELY = {
-    "thrust": (1e-3, 1e3),
-    "rotor_speed": (50.0, 1e4),
-    "share": (0.05, 1.0),
-}
+LIKELY = {"thrust": (1e-3, 1e3), "rotor_speed": (50.0, 1e4), "share": (0.05, 1.0)}
 # Beyond these, single commands are glitches
 LARGEST_COMMANDS = {"thrust": 2e3, "rotor_speed": 2e4}
 MOST_RATE = 100.0  # rad/s, beyond what gyros measure
 
 
 def refuse_unlike(
-    path: Path,
-    what: str,
-    measured: FloatArray,
-    other: FloatArray,
-    step: float,
+    path: Path, what: str, measured: FloatArray, other: FloatArray, step: float
 ) -> None:
     """Refuse columns (n, 3) that have another unit, sign or axis than what others say.
 
@@ -94,8 +86,5 @@ def _well_above_ground(mean: FloatArray, step: float) -> BoolArray:
     top = mean.max()
     usual = np.quantile(mean[mean >= min(0.2 * top, top)], 0.7)
     is_low = mean <= FLYING_SHARE * usual
-    near = binary_dilation(
-        is_low,
-        iterations=round(NEAR_GROUND / step),
-    )
+    near = binary_dilation(is_low, iterations=round(NEAR_GROUND / step))
     return np.asarray(~near)

@@ -46,12 +46,7 @@ class Model:
     :param horizons: where predictions are compared, s.
     """
 
-    def __init__(
-        self,
-        logs: Sequence[Log],
-        start: Guess,
-        horizons: FloatArray,
-    ) -> None:
+    def __init__(self, logs: Sequence[Log], start: Guess, horizons: FloatArray) -> None:
         self.logs = logs
         self.start = start
         self.table = parameters_of(logs, start)
@@ -91,12 +86,7 @@ class Model:
         """
         guess = self.guess(vector)
         windows = self.windows
-        thrusts = log_thrusts(
-            self.logs,
-            guess.vehicle,
-            guess.curve,
-            guess.delay,
-        )
+        thrusts = log_thrusts(self.logs, guess.vehicle, guess.curve, guess.delay)
         flown = windows.fly(guess.vehicle, thrusts)
         errors = []
         for end, (motion, force) in zip(windows.ends, flown, strict=True):

@@ -32,11 +32,7 @@ ORDERS_OF = FORMATS.pop("orders")
 DOWN = FORMATS.pop("down")
 MARKS = FORMATS.pop("marks")
 COMMANDS = ("thrust", "rotor_speed", "share")
-NEEDED = {
-    "time": ["time"],
-    "motor commands": COMMANDS,
-    "gyro": ["gyro"],
-}
+NEEDED = {"time": ["time"], "motor commands": COMMANDS, "gyro": ["gyro"]}
 WAY_OUT = (
     "a log has motor commands, gyro, and an accelerometer or attitude and velocity; "
     "docs/your_vehicle.md lists the columns of each format"

@@ -10,12 +10,7 @@ from sb3_quad.base.types import BoolArray, FloatArray
 LONGEST_GAP = 0.05
 
 
-def cleaned(
-    name: str,
-    table: FloatArray,
-    largest: float,
-    notes: list[str],
-) -> FloatArray:
+def cleaned(name: str, table: FloatArray, largest: float, notes: list[str]) -> FloatArray:
     """Return a series without rows that hold no numbers, or glitches, or are of the same time.
 
     :param name: of the series, for messages.
@@ -70,11 +65,7 @@ def without_gaps(series: FloatArray, grid: FloatArray) -> BoolArray:
     return near
 
 
-def means_of_steps(
-    commands: FloatArray,
-    begins: FloatArray,
-    step: float,
-) -> FloatArray:
+def means_of_steps(commands: FloatArray, begins: FloatArray, step: float) -> FloatArray:
     """Return the mean of each step of commands that are held until the next one, (n, columns).
 
     :param begins: of the steps, at regular times, (n,), s.

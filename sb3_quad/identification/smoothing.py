@@ -28,16 +28,8 @@ def smoothed(log: Log) -> FloatArray:
     attitude = _turned(log)
     force = attitude.apply(log.force) - UPWARD
     motion[:, QUATERNION] = quaternions(attitude)
-    motion[:, VELOCITY] = _follow(
-        motion[:, VELOCITY],
-        force,
-        log.step,
-    )
-    motion[:, POSITION] = _follow(
-        motion[:, POSITION],
-        motion[:, VELOCITY],
-        log.step,
-    )
+    motion[:, VELOCITY] = _follow(motion[:, VELOCITY], force, log.step)
+    motion[:, POSITION] = _follow(motion[:, POSITION], motion[:, VELOCITY], log.step)
     return motion
 
 
