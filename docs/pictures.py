@@ -1,7 +1,7 @@
 r"""Make pictures of the pages again, each by the commands that stand with its name.
 
-Scripts drew cloning.png, learning_speed.png and robustness.png, and a report tracking_times.png;
-commit 5e3ee3c0 is the last that has them.
+Scripts drew cloning.png and learning_speed.png, and a report tracking_times.png; commit 5e3ee3c0 is
+the last that has them.
 
     make pictures                       # all of them
     make pictures ARGS="starts.png"     # only these
@@ -12,6 +12,7 @@ commands run in ``build/pictures/``. What is flown there is kept for later calls
 """
 
 import argparse
+import math
 import os
 import shlex
 import shutil
@@ -44,11 +45,21 @@ sb3-quad enjoy "RL agent=itm-recovery" geometric "PID expert=pid"
 frame film.webp 32 film_frame.png
 """,
     "side_hit_size.png": CHAPTER_4
-    + "success thesis side_hit_size 0 'factor of the hit' side_hit_size.png",
+    + "success thesis side_hit_size.png 'side_hit_size 0 factor of the hit'",
     "starts.png": """
 sb3-quad evaluate PID=pid geometric "imitation agent=itm-imitation" "RL agent=itm-recovery"
     --suite robustness --scenario starts -o starts
-success starts starts 0 'tilt at the start, °' starts.png
+success starts starts.png 'starts 0 tilt at the start, °'
+""",
+    "robustness.png": """
+sb3-quad evaluate PID=pid geometric "RL agent=itm-recovery" itm-robust any-quadcopter
+    --suite robustness --scenario mass constant_force motor_gain delay noise wandering_gusts
+    -o robustness
+success robustness robustness.png
+    "mass 0 mass (times the vehicle's own)" "constant_force 0 force (N)"
+    "wandering_gusts 0 gusts, standard deviation (N)"
+    "motor_gain 0 motor gain (times the vehicle's own)" "delay 0 delay (control steps)"
+    "noise 0 observation noise (relative)"
 """,
 }
 
@@ -68,8 +79,8 @@ def run(words: list[str]) -> None:
         frame(BUILD / arguments[0], int(arguments[1]), BUILD / arguments[2])
         return
     if program == "success":
-        folder, group, axis, label, picture = arguments
-        success(BUILD / folder, group, int(axis), label, BUILD / picture)
+        folder, picture, *panels = arguments
+        success(BUILD / folder, BUILD / picture, *panels)
         return
     if program == "sb3-quad":
         arguments = ["-m", "sb3_quad.cli", *arguments]
@@ -89,31 +100,51 @@ def frame(film: Path, number: int, picture: Path) -> None:
         frames.convert("RGB").save(picture, optimize=True)
 
 
-def success(folder: Path, group: str, axis: int, label: str, picture: Path) -> None:
+def success(folder: Path, picture: Path, *panels: str) -> None:
     """Draw success over a number in the names of a grid's cells: the mean over the other numbers,
-    in a band from the least to the greatest.
+    in a band from the least to the greatest. With several panels, draw the median of the final
+    errors of flights that survive below each.
+
+    :param panels: "SCENARIO AXIS LABEL": the grid, the place of its number, and the name of that.
     """
     import pandas as pd
     from matplotlib import pyplot
 
-    from sb3_quad.evaluation.plots import STYLE
+    from sb3_quad.evaluation.plots import STYLE, legend
     from sb3_quad.evaluation.results import load_results
 
     results = load_results(folder)
     pyplot.rcParams.update(STYLE)
-    _, axes = pyplot.subplots(figsize=(5.0, 3.3), layout="constrained")
-    for controller, colour in results.colours.items():
-        rows = []
-        for entry in results.entries:
-            name, _, cell = entry.scenario.partition(".")
-            if (name, entry.controller) == (group, controller):
-                rows.append((float(cell.split("_")[axis]), entry.metrics.success.value))
-        cells = pd.DataFrame(rows).groupby(0)[1].agg(["mean", "min", "max"])
-        axes.plot(cells.index, cells["mean"], "o-", color=colour, label=controller, markersize=3.5)
-        axes.fill_between(cells.index, cells["min"], cells["max"], color=colour, alpha=0.16)
-    axes.set(xlabel=label, ylabel="success", ylim=(-0.03, 1.03))
-    axes.legend()
-    pyplot.savefig(picture, dpi=150)
+    quantities = ["success", "final_error_median"][: len(panels)]
+    columns = min(len(panels), 3)
+    lines = -(-len(panels) // columns) * len(quantities)
+    figure = pyplot.figure(figsize=(4.2 * columns + 0.8, 2.5 * lines + 0.8), layout="constrained")
+    for number, panel in enumerate(panels):
+        group, axis, label = panel.split(maxsplit=2)
+        for row, quantity in enumerate(quantities):
+            line = number // columns * len(quantities) + row
+            axes = figure.add_subplot(lines, columns, line * columns + number % columns + 1)
+            for controller, colour in results.colours.items():
+                cells = []
+                for entry in results.entries:
+                    name, _, cell = entry.scenario.partition(".")
+                    if (name, entry.controller) == (group, controller):
+                        # Without a survivor there is no final error.
+                        metric = getattr(entry.metrics, quantity)
+                        value = metric.value if metric else math.nan
+                        cells.append((float(cell.split("_")[int(axis)]), value))
+                table = pd.DataFrame(cells, dtype=float).groupby(0)[1].agg(["mean", "min", "max"])
+                axes.plot(
+                    table.index, table["mean"], "o-", color=colour, label=controller, markersize=3.5
+                )
+                axes.fill_between(table.index, table["min"], table["max"], color=colour, alpha=0.16)
+            if quantity == "success":
+                axes.set(ylabel="success", ylim=(-0.03, 1.03))
+            else:
+                axes.set(ylabel="final error, median (m)", yscale="log", ylim=(3e-4, 10.0))
+        axes.set(xlabel=label)
+    legend(figure)
+    figure.savefig(picture, dpi=150)
 
 
 def main() -> None:
