@@ -162,9 +162,10 @@ def _push(rows, lane, is_pushed):
 
 
 @inlined
-def _accelerate(b, lane, dt, in_air, is_pushed):
+def _accelerate(b, lane, per_second, in_air, is_pushed):
     """Advance rotor speeds, velocity and body rates of a lane by a physics step, in place.
 
+    :param per_second: 1 / dt, 1/s.
     :param in_air: a constant, whether the terms of :mod:`.aerodynamics` act; ``is_pushed``,
         likewise, see :func:`fly`.
     """
@@ -201,7 +202,7 @@ def _accelerate(b, lane, dt, in_air, is_pushed):
     torque = add(torque, add(subtract(in_body, gyroscopic), moments))
     if in_air:
         after = rotor_momentum(b, b.rotor_speeds, lane)
-        reaction = 0.0, 0.0, (momentum - after) / dt
+        reaction = 0.0, 0.0, (momentum - after) * per_second
         torque = add(torque, add(air_moment(b, airspeed, w, total, after, lane), reaction))
     w = add(w, multiply(vector(b.rates_gain, lane), torque))
 
@@ -222,12 +223,17 @@ def accelerate(b, is_pushed):
 
 
 @inner(fastmath=True, forceinline=False)
-def accelerate_in_air(b, dt):
+def accelerate_in_air(b, dt, is_pushed):
     """Advance them with the terms of :mod:`.aerodynamics`. It is not a part of its caller, which
     would then fly more slowly without air.
     """
-    for lane in range(LANES):
-        _accelerate(b, lane, dt, True, True)
+    per_second = 1.0 / dt
+    if is_pushed:
+        for lane in range(LANES):
+            _accelerate(b, lane, per_second, True, True)
+    else:
+        for lane in range(LANES):
+            _accelerate(b, lane, per_second, True, False)
 
 
 @fast
@@ -312,7 +318,7 @@ def fly(b, physics_step, substeps, in_air, by_rates, is_pushed):
         if by_rates:
             command_by_rates(b)
         if in_air:
-            accelerate_in_air(b, physics_step)
+            accelerate_in_air(b, physics_step, is_pushed)
         else:
             accelerate(b, is_pushed)
         if _may_exceed(b):
