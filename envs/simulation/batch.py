@@ -138,9 +138,7 @@ class QuadcopterBatch:
         self.randomize_numbers = self.randomize.numbers(control_step)
         # An array without columns means that gusts, frames or the integral are switched off.
         self.gust = np.zeros((GUST_SIZE, n * bool(self.randomize.gusts)))
-        self._wind = np.zeros((3, n))
-        # Whether a step must look for what pushes
-        self.may_push = self.randomize.sets_wrench or self.randomize.wind is not None
+        self.wind = np.zeros((3, n))
         self.wind_gust = np.zeros((GUST_SIZE, n * bool(self.randomize.wind_gusts)))
 
         self._set_recordings(settings, control_step)
@@ -189,7 +187,7 @@ class QuadcopterBatch:
         self._state = np.zeros((STATE_SIZE, n))
         # Whether a step has moved references since their velocities were last written
         self._is_behind = False
-        self._wrench = np.zeros((WRENCH_SIZE, n))
+        self.wrench = np.zeros((WRENCH_SIZE, n))
         self.streams = np.zeros((4, n), dtype=np.uint32)
         self.returns = np.zeros(n)
         is_calm = self.task_parameters[:, T.calm_cost].any()
@@ -504,33 +502,9 @@ class QuadcopterBatch:
             self._is_behind = False
         return self._state
 
-    @property
-    def wrench(self) -> FloatArray:
-        """The external wrench that was set or sampled, (WRENCH_SIZE, n). You may write to it."""
-        self._let_push()
-        return self._wrench
-
-    @property
-    def wind(self) -> FloatArray:
-        """The velocity of the air that was set or sampled, (3, n). You may write to it."""
-        self._let_push()
-        return self._wind
-
-    def _let_push(self) -> None:
-        """Let all later steps look for what pushes, since whoever has the arrays may write it."""
-        if not self.may_push:
-            self.may_push = True
-            self._bind()
-
-    def _own(self, name: str) -> Any:
-        """Return an attribute itself, without what its property does."""
-        own = vars(self)
-        return own[f"_{name}" if f"_{name}" in own else name]
-
     def snapshot(self) -> Arrays:
         """Return copies of everything that future flight depends on, by name."""
-        arrays = {name: self._own(name) for name in _KEPT} | {"state": self.state}
-        return {name: array.copy() for name, array in arrays.items()}
+        return {name: getattr(self, name).copy() for name in _KEPT}
 
     def restore(self, snapshot: Arrays) -> None:
         """Undo everything that has happened since :meth:`snapshot`.
@@ -592,4 +566,4 @@ class QuadcopterBatch:
         self.mean = self.scaling[:OBSERVATION_SIZE]
         self.std = self.scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE]
         self.noise_level, self.additive_level = self.scaling[-2:]
-        self._arguments = {name: self._own(name) for name in BATCH_ARGUMENTS}
+        self._arguments = {name: getattr(self, name) for name in BATCH_ARGUMENTS}

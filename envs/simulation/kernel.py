@@ -199,7 +199,7 @@ def step(
     streams, scaling, task_index, task_parameters, task_weights, returns, limits, max_steps,
     outcome, last_observations, last_actions,
     moves, course, tracks, track_numbers, previews,
-    physics_step, substeps, in_air, may_push, autoreset,
+    physics_step, substeps, in_air, autoreset,
 ):  # fmt: skip
     """Compute a control step of all rows. Each thread takes chunks of rows until none is left, see
     :func:`.threads.share_out`.
@@ -249,7 +249,6 @@ def step(
         ``track_numbers``; ``previews`` int64, control steps ahead that are observed.
     :param physics_step: s; a control step has ``substeps`` of them.
     :param in_air: whether the terms of :mod:`.aerodynamics` act on some vehicle.
-    :param may_push: False: ``wrench`` and ``wind`` hold zeros alone, and are not read.
     :param autoreset: whether a row that ends begins its next episode within the same step.
     :return: False if an action is not finite; then nothing has changed.
     """
@@ -300,9 +299,7 @@ def step(
             else:
                 load_rows(state, first, b.resting)
             if mode == FLY:
-                is_pushed = adds
-                if may_push and not adds:
-                    is_pushed = _acts(wrench, first, count) or _acts(wind, first, count)
+                is_pushed = adds or _acts(wrench, first, count) or _acts(wind, first, count)
                 if is_pushed:
                     load_rows(wrench, first, b.wrench)
                     load_rows(wind, first, b.wind)
