@@ -228,7 +228,7 @@ class Firmware:
 
 @pytest.mark.parametrize(
     ("name", "n"),
-    [("crazyflie-recovery", 40), pytest.param("any-quadcopter", 12, marks=pytest.mark.slow)],
+    [("crazyflie-recovery", 24), pytest.param("any-quadcopter", 8, marks=pytest.mark.slow)],
 )
 def test_it_recovers_as_its_zip(tmp_path, name, n):
     """In the same n recoveries, without noise; the second agent has a state."""
