@@ -19,6 +19,12 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from sb3_quad.evaluation.results import Results
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -64,6 +70,10 @@ success robustness robustness.png
 }
 
 
+# What is drawn, and the least of it that is
+LEAST = {"success": 0.0, "final_error_median": 1e-3}
+
+
 def commands(text: str) -> list[list[str]]:
     """Return the words of each command of a picture."""
     return [shlex.split(line) for line in text.strip().replace("\n    ", " ").splitlines() if line]
@@ -101,13 +111,11 @@ def frame(film: Path, number: int, picture: Path) -> None:
 
 
 def success(folder: Path, picture: Path, *panels: str) -> None:
-    """Draw success over a number in the names of a grid's cells: the mean over the other numbers,
-    in a band from the least to the greatest. With several panels, draw the median of the final
-    errors of flights that survive below each.
+    """Draw success over a number in the names of a grid's cells. With several panels, draw the
+    median of the final errors of flights that survive below each.
 
     :param panels: "SCENARIO AXIS LABEL": the grid, the place of its number, and the name of that.
     """
-    import pandas as pd
     from matplotlib import pyplot
 
     from sb3_quad.evaluation.plots import STYLE, legend
@@ -115,36 +123,45 @@ def success(folder: Path, picture: Path, *panels: str) -> None:
 
     results = load_results(folder)
     pyplot.rcParams.update(STYLE)
-    quantities = ["success", "final_error_median"][: len(panels)]
+    quantities = [*LEAST][: len(panels)]
     columns = min(len(panels), 3)
     lines = -(-len(panels) // columns) * len(quantities)
     figure = pyplot.figure(figsize=(4.2 * columns + 0.8, 2.5 * lines + 0.8), layout="constrained")
     for number, panel in enumerate(panels):
-        group, axis, label = panel.split(maxsplit=2)
+        scenario, place, label = panel.split(maxsplit=2)
         for row, quantity in enumerate(quantities):
             line = number // columns * len(quantities) + row
             axes = figure.add_subplot(lines, columns, line * columns + number % columns + 1)
-            for controller, colour in results.colours.items():
-                cells = []
-                for entry in results.entries:
-                    name, _, cell = entry.scenario.partition(".")
-                    if (name, entry.controller) == (group, controller):
-                        # Without a survivor there is no final error.
-                        metric = getattr(entry.metrics, quantity)
-                        value = metric.value if metric else math.nan
-                        cells.append((float(cell.split("_")[int(axis)]), value))
-                table = pd.DataFrame(cells, dtype=float).groupby(0)[1].agg(["mean", "min", "max"])
-                axes.plot(
-                    table.index, table["mean"], "o-", color=colour, label=controller, markersize=3.5
-                )
-                axes.fill_between(table.index, table["min"], table["max"], color=colour, alpha=0.16)
-            if quantity == "success":
-                axes.set(ylabel="success", ylim=(-0.03, 1.03))
-            else:
-                axes.set(ylabel="final error, median (m)", yscale="log", ylim=(3e-4, 10.0))
+            draw(axes, results, scenario, int(place), quantity)
         axes.set(xlabel=label)
     legend(figure)
     figure.savefig(picture, dpi=150)
+
+
+def draw(axes: "Axes", results: "Results", scenario: str, place: int, quantity: str) -> None:
+    """Draw a quantity of all controllers over a number of the cells: the mean over the other
+    numbers, in a band from the least to the greatest.
+    """
+    import pandas as pd
+
+    for controller, colour in results.colours.items():
+        cells = []
+        for entry in results.entries:
+            name, _, cell = entry.scenario.partition(".")
+            if (name, entry.controller) == (scenario, controller):
+                # Without a survivor there is no final error.
+                metric = getattr(entry.metrics, quantity)
+                value = metric.value if metric else math.nan
+                cells.append((float(cell.split("_")[place]), value))
+        table = pd.DataFrame(cells, dtype=float).groupby(0)[1].agg(["mean", "min", "max"])
+        table = table.clip(LEAST[quantity])
+        axes.plot(table["mean"], "o-", color=colour, label=controller, markersize=3.5)
+        axes.fill_between(table.index, table["min"], table["max"], color=colour, alpha=0.16)
+    if quantity == "success":
+        axes.set(ylabel="success", ylim=(-0.03, 1.03))
+    else:
+        axes.set(ylabel="final error, median (m)", yscale="log", ylim=(8e-4, 10.0))
+        axes.yaxis.set_major_formatter("{x:g}")
 
 
 def main() -> None:
