@@ -319,7 +319,7 @@ PIPELINES = "two_stage.yml", "imitation.yml", "robust/crazyflie.yml", "rates.yml
 )
 def test_packaged_files_hold_good_settings(name):
     algo = name.rpartition("/")[2].removesuffix(".yml")
-    algo = {"reference": "ppo_bc", "following": "apg", "hover": "apg"}.get(algo, algo)
+    algo = {"reference": "ppo_bc", "following": "apg"}.get(algo, algo)
     assert {*ENVIRONMENTS} <= SETTINGS.read(name)[0].keys()
     for env_id in ENVIRONMENTS:
         config = load_config(algo, env_id, name)
