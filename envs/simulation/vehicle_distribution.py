@@ -30,7 +30,7 @@ from sb3_quad.envs.simulation.randomization import (
     numbers_of,
 )
 from sb3_quad.envs.simulation.state import P, first_rows
-from sb3_quad.envs.vehicles.rates import derived_gain, derived_limit
+from sb3_quad.envs.vehicles.rates import LEAST_DERIVED_LIMITS, derived_gain, derived_limit
 from sb3_quad.envs.vehicles.vehicle import Vehicle
 
 DISTRIBUTIONS = YamlFolder("vehicle distribution", "sb3_quad.envs.vehicles.distributions")
@@ -225,7 +225,7 @@ def sample_from_distribution(i, streams, table, vehicles):
         inertia = v[P.ixx + axis]
         v[P.rate_gain_x + axis] = gain * inertia
         turn = arms * v[P.thrust_half_range] / inertia
-        v[P.rate_limit_x + axis] = _derived_limit(turn, gain)
+        v[P.rate_limit_x + axis] = _derived_limit(turn, gain, LEAST_DERIVED_LIMITS[axis])
 
 
 @called

@@ -20,7 +20,10 @@ LARGEST_LAG = 0.1  # s
 LAG = 0.002  # s
 # Gain times the lag of motors and filter: the loop has a damping ratio of 0.71.
 GAIN_TIMES_LAG = 0.5
-LARGEST_DERIVED_LIMIT = 20.0  # rad/s
+# rad/s, by axis. Less would be a command range seven times as narrow as that of other vehicles,
+# where motors are quick and weak.
+LEAST_DERIVED_LIMITS = (10.0, 10.0, 0.0)
+LARGEST_DERIVED_LIMIT = 20.0
 # Rotors idle at this part of their greatest thrust or more, as in airmode, so that none stops.
 IDLE = 0.001
 PRESETS = {
@@ -45,7 +48,7 @@ class RateLoop(Frozen):
 
     limits: tuple[Limit, Limit, Limit] | None = None
     """greatest commanded roll, pitch and yaw rate, rad/s; default: the rates at which the loop asks
-    for the whole moment of the rotors from rest, up to 20 rad/s
+    for the whole moment of the rotors from rest, 10 (roll, pitch) to 20 rad/s
     """
     gains: tuple[Gain, Gain, Gain] | None = None
     """k, angular acceleration per error of each body rate, 1/s; default: 0.5 divided by the time
@@ -69,6 +72,6 @@ def derived_gain(lag: float, up: float, down: float) -> float:
     return GAIN_TIMES_LAG / (lag + 0.5 / up + 0.5 / down)
 
 
-def derived_limit(acceleration: float, gain: float) -> float:
+def derived_limit(acceleration: float, gain: float, least: float) -> float:
     """Return the default limit, rad/s, for the greatest angular acceleration, rad/s²."""
-    return min(acceleration / gain, LARGEST_DERIVED_LIMIT)
+    return min(max(acceleration / gain, least), LARGEST_DERIVED_LIMIT)

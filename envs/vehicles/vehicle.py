@@ -15,6 +15,7 @@ from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.vehicles.gains import GeometricGains
 from sb3_quad.envs.vehicles.layout import NamedLayout, Turn, find_turn
 from sb3_quad.envs.vehicles.rates import (
+    LEAST_DERIVED_LIMITS,
     RATE_PARAMETERS,
     RateLoop,
     derived_gain,
@@ -424,7 +425,8 @@ class Vehicle(Frozen):
         gain = derived_gain(lag, self.motor_gain_up, self.motor_gain_down)
         gains = self.rates.gains or (gain, gain, gain)
         turns = np.abs(self.mixer[1:]).sum(axis=1) * half / self.inertia
-        derived = [derived_limit(*axis) for axis in zip(turns.tolist(), gains, strict=True)]
+        axes = zip(turns.tolist(), gains, LEAST_DERIVED_LIMITS, strict=True)
+        derived = [derived_limit(*axis) for axis in axes]
         return [*(self.rates.limits or derived)], [*gains]
 
     @property
