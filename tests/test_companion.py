@@ -187,7 +187,11 @@ def test_the_policy_sees_its_frames_and_keeps_its_state(tmp_path):
     )
     opset = [onnx.helper.make_opsetid("", 13)]
     model = onnx.helper.make_model(graph, opset_imports=opset, ir_version=8)
-    facts = {"period": "0.02 s between calls", "vehicle": "a: hover thrust 1 N, kF unknown"}
+    facts = {
+        "period": "0.02 s between calls",
+        "vehicle": "a: hover thrust 1 N, kF unknown",
+        "observation": "18-20 acceleration of the reference in 5 control steps, turned",
+    }
     onnx.helper.set_model_props(model, facts | {"result": "4 numbers: the thrust of each rotor"})
     onnx.save(model, tmp_path / "a.onnx")
     with pytest.raises(ValueError, match="action: rates"):
@@ -202,7 +206,7 @@ def test_the_policy_sees_its_frames_and_keeps_its_state(tmp_path):
         body_rates=np.array([5.0, 0.0, 0.0]),
     )
     thrust, rates = policy(state, TARGET)
-    assert policy.period == 0.02
+    assert policy.period == 0.02 and policy.preview == [5]
     assert thrust == pytest.approx(2.1) and rates == pytest.approx([3.0, 5.0, 0.0], abs=1e-6)
     policy(state, TARGET)
     assert policy.values[1].tolist() == [[2.0, 2.0]]

@@ -78,7 +78,7 @@ class Policy:
         self.weight = 4.0 * float(np.mean([float(number) for number in hover]))
         self.period = float(facts["period"].split()[0])
         #: Steps ahead of which it takes the acceleration of the reference
-        ahead = re.findall(r"reference in (\d+) control steps", facts.get("observation", ""))
+        ahead = re.findall(r"reference in (\d+) control steps", facts["observation"])
         self.preview = [int(steps) for steps in ahead]
         self.inputs = self.session.get_inputs()
         self.reset()
