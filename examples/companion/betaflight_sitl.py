@@ -206,7 +206,7 @@ class Sitl:
             self.sticks([*channels(throttle, np.zeros(3)), 2000])
             self.rest(0.05)
             speeds.append(self.motors[0])
-        return float(np.interp(speed, speeds, throttles))
+        return np.interp(speed, speeds, throttles)
 
     def close(self) -> None:
         os.close(self.go)
@@ -248,10 +248,11 @@ def starts(flight, n, seed):
 def new_batch(flight, start, pilot, vehicle, action):
     """Return vehicles at the start of their flights, and let the pilot begin, too."""
     n = start["target"].shape[1]
-    preview = []
+    preview = None
     if isinstance(pilot, Policy):
         pilot.reset(n)
-        preview = [round(ahead * PERIOD / vehicle.control_step) for ahead in pilot.preview]
+        ratio = PERIOD / vehicle.control_step
+        preview = tuple(round(ahead * ratio) for ahead in pilot.preview)
     settings = FlightSettings(
         vehicle=vehicle,
         action=action,
