@@ -137,6 +137,10 @@ def test_sampled_vehicles_have_the_loops_that_their_files_would_have():
     theirs = np.stack([vehicle.parameters() for vehicle in vehicles], axis=1)
     at = slice(P.rate_limit_x, P.rate_limit_x + len(RATE_PARAMETERS))
     np.testing.assert_allclose(batch.vehicles[at], theirs[at], rtol=1e-9)
+    # Quick motors with little torque are not left with a few rad/s.
+    turning = batch.vehicles[P.rate_limit_x : P.rate_limit_x + 2]
+    assert turning.min() == 10.0 and turning.max() == 20.0
+    assert batch.vehicles[P.rate_limit_x + 2].min() < 10.0
 
 
 def test_a_vehicle_that_is_turned_keeps_the_loop_of_each_axis():
