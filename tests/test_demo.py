@@ -179,12 +179,13 @@ BATTERY = NamedLayout(rotor_order="px4", arm_length=0.24, center_of_mass=(-0.03,
 
 
 def vehicle_called(name):
-    """A shipped vehicle, or ITM in wind, in another world, or with its battery elsewhere."""
+    """A shipped vehicle, or ITM in wind, in another world, with another battery or motors."""
     if name in VEHICLES.names():
         return load_vehicle(name)
     changes = {
         "airy": AIRY,
         "battery": {**BATTERY, "thrust_coefficient": 0.0},
+        "quick motors": {"motor_gain_up": 100.0, "motor_gain_down": 100.0},
     }.get(name, {})
     return load_vehicle("itm").model_copy(update=changes)
 
@@ -200,6 +201,7 @@ def vehicle_called(name):
         ("battery", "thrusts"),
         ("other world", "rates"),
         ("battery", "rates"),
+        ("quick motors", "rates"),
     ],
 )
 def test_given_actions_lead_to_where_python_flies(name, action, tmp_path):

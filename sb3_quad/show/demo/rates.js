@@ -10,7 +10,8 @@ import { armsOf, hoverShares, hoverThrust, mixerInverse, motorGains, thrustRange
 
 const FILTER_LAG = 0.002; // s; this and the next ones are those of envs/vehicles/rates.py
 const GAIN_TIMES_LAG = 0.5;
-const LARGEST_DERIVED_LIMIT = 20; // rad/s
+const LEAST_DERIVED_LIMITS = [10, 10, 0]; // rad/s
+const LARGEST_DERIVED_LIMIT = 20;
 const IDLE = 0.001;
 const AXES = [0, 1, 2];
 const ROTORS = [0, 1, 2, 3];
@@ -37,7 +38,8 @@ export class RateLoop {
     const axes = [this.#squares(this.inertia), this.#squares(limits ?? [0, 0, 0]), this.#squares(this.gains)];
     const turned = { ...vehicle, rotor_positions: vehicle.rotor_positions.map(([x, y]) => this.#turned(x, y, 1)) };
     const reach = armsOf(turned).map((arms) => arms.reduce((sum, arm) => sum + Math.abs(arm), 0) * ((high - low) / 2));
-    const derived = AXES.map((k) => Math.min(reach[k] / axes[0][k] / axes[2][k], LARGEST_DERIVED_LIMIT));
+    const rates = AXES.map((k) => reach[k] / axes[0][k] / axes[2][k]);
+    const derived = AXES.map((k) => clip(rates[k], LEAST_DERIVED_LIMITS[k], LARGEST_DERIVED_LIMIT));
     this.limits = limits ? axes[1] : derived;
     this.mix = mixerInverse(vehicle).map((row) => row.slice(1));
     this.shares = hoverShares(vehicle).map((share) => share / 4);
