@@ -73,5 +73,8 @@ def derived_gain(lag: float, up: float, down: float) -> float:
 
 
 def derived_limit(acceleration: float, gain: float, least: float) -> float:
-    """Return the default limit, rad/s, for the greatest angular acceleration, rad/s²."""
+    """Return the default limit, rad/s, for the greatest angular acceleration, rad/s².
+
+    :param least: the axis' entry of ``LEAST_DERIVED_LIMITS``.
+    """
     return min(max(acceleration / gain, least), LARGEST_DERIVED_LIMIT)
