@@ -22,6 +22,9 @@ from sb3_quad.envs.simulation.vectors import (
 from sb3_quad.experts.geometric_gains import G
 from sb3_quad.experts.protocol import command_rates
 
+# The greatest rate of a turn, in those from which the loop asks for the planned deceleration.
+STOPPABLE = 1.2
+
 
 @compiled
 def fly_geometric(state, constants, wrench, by_rates, actions):
@@ -72,8 +75,11 @@ def fly_geometric(state, constants, wrench, by_rates, actions):
         rate, nx, ny = desired_turn(b, omega, gains)
         if by_rates:
             yaw_rate = desired_yaw_rate(state, i, body_to_world, gains)
-            wanted = rate * nx, rate * ny, yaw_rate
             loop = vector_at(constants.vehicles, P.rate_gain_x, k)
+            # A vehicle with little torque could not stop from a rate far above the one from which
+            # the loop asks for the planned deceleration.
+            rate = min(rate, STOPPABLE * gains[G.angular_deceleration] * inertia[0] / loop[0])
+            wanted = rate * nx, rate * ny, yaw_rate
             for axis in range(3):
                 # A loop slower than the law gets more than the wanted rate, to be as quick. It
                 # gives a moment if the rates differ by that over its gain.
