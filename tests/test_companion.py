@@ -1,6 +1,8 @@
 """The companion loop of examples/companion, against fakes of the flight controllers' side."""
 
+import json
 import math
+import socket
 import struct
 import sys
 from pathlib import Path
@@ -376,3 +378,60 @@ def test_betaflight_gets_sticks_and_the_pilot_decides():
     fake.read = lambda size: b""
     with pytest.raises(RuntimeError, match="does not answer"):
         link.look()
+
+
+FAKE_ARDUPILOT = """\
+#!{python}
+import socket
+import struct
+
+end = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+end.settimeout(30.0)
+for frame in range(10_000):
+    pulses = [1600, 1700, 1800, 1900] if frame > 200 else [1000] * 4
+    packet = struct.pack("<HHI16H", 18458, 1000, frame, *pulses, *[1000] * 12)
+    for _ in range(1 + frame % 2):  # repeated, as when it waits for long
+        end.sendto(packet, ("127.0.0.1", {port}))
+    with open("seen", "ab") as seen:
+        seen.write(end.recv(4096))
+"""
+
+
+def free_port():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
+        end.bind(("127.0.0.1", 0))
+        return end.getsockname()[1]
+
+
+def test_ardupilot_sees_its_frames_and_drives_the_motors(tmp_path, monkeypatch):
+    pytest.importorskip("pymavlink", reason="pip install '.[companion]'")
+    import ardupilot_sitl
+
+    from sb3_quad import load_vehicle
+
+    port = free_port()
+    monkeypatch.setattr(ardupilot_sitl, "PHYSICS", ("127.0.0.1", port))
+    monkeypatch.setattr(ardupilot_sitl, "LINK", f"127.0.0.1:{free_port()}")
+    program = tmp_path / "arducopter"
+    program.write_text(FAKE_ARDUPILOT.format(python=sys.executable, port=port))
+    program.chmod(0o755)
+    values = ardupilot_sitl.parameters(load_vehicle(ROOT / "examples" / "five_inch.yaml"))
+    sitl = ardupilot_sitl.ArduPilot(program, values)
+    try:
+        assert sitl.time > 0.2  # it asked until the motors turned
+        sitl.velocity = np.zeros(3)
+        rolled = turned([1.0, 0.0, 0.0], 90.0)  # its left side is up
+        moves = {"velocity": np.array([0.001, 0.002, 0.003]), "body_rates": np.array([1, 2, 3])}
+        motors = sitl.step(at_rest(quaternion=rolled, **moves))
+        np.testing.assert_allclose(motors, [0.6, 0.7, 0.8, 0.9])
+        line = (sitl.folder / "seen").read_text().strip().splitlines()[-1]
+    finally:
+        sitl.close()
+    assert not sitl.folder.exists()
+    seen = json.loads(line)
+    assert seen["gyro"] == [1.0, -2.0, -3.0]
+    assert seen["position"] == [0.0, -0.0, -2.0]
+    assert seen["velocity"] == [0.001, -0.002, -0.003]
+    np.testing.assert_allclose(seen["quaternion"], rolled)
+    # Gravity is felt to the left, 1 m/s² forward, as 3 m/s² up, and 2 m/s² that are now down.
+    np.testing.assert_allclose(seen["accel_body"], [1.0, -(core.GRAVITY + 3.0), 2.0], atol=1e-9)

