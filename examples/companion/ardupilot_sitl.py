@@ -21,10 +21,10 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from betaflight_sitl import PERIOD, STEP, compare, parser_of
 from core import GRAVITY, State
 from pymavlink import mavutil
-from via_px4 import MAV, TURN, Px4
+from sitl_flights import PERIOD, STEP, compare, parser_of
+from via_px4 import MAV, QUATERNION_TURN, TURN, Px4
 
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
@@ -33,7 +33,6 @@ ANYWAY = 21196  # arm whatever the checks say
 LINK = "127.0.0.1:14550"
 PHYSICS = ("127.0.0.1", 9002)
 SETTLING = 1.5  # s, for its target attitude before a flight
-HALF_TURN = np.array([1.0, 1.0, -1.0, -1.0])  # about x, for quaternions
 PARAMETERS = {
     "AHRS_EKF_TYPE": 10,  # the simulated attitude
     "ARMING_CHECK": 0,
@@ -112,7 +111,7 @@ class ArduPilot:
             if self.time > 60.0:
                 self.close()
                 raise RuntimeError("the SITL does not arm")
-            self.link.order(MAV.MAV_CMD_DO_SET_MODE, 1, GUIDED)
+            self.link.set_mode(GUIDED)
             self.link.order(MAV.MAV_CMD_COMPONENT_ARM_DISARM, 1, ANYWAY)
             self.begin(level)
 
@@ -138,7 +137,7 @@ class ArduPilot:
         }
         # North, east, down and forward, right, down. It takes what it finds, nested or not.
         seen = {name: [*(TURN * vector)] for name, vector in vectors.items()}
-        quaternion = [*(HALF_TURN * state.quaternion)]
+        quaternion = [*(QUATERNION_TURN * state.quaternion)]
         shown = {"timestamp": self.time, "imu": 0, "quaternion": quaternion, **seen}
         line = json.dumps(shown, separators=(",", ":"))
         self.physics.sendto(f"\n{line}\n".encode(), self.address)
@@ -154,7 +153,12 @@ class ArduPilot:
         still = np.zeros(3)
         self.velocity = still
         held = State(0.0, state.position, state.quaternion, still, still)
-        command = 7, [*(HALF_TURN * state.quaternion)], *still, self.hover  # 7: no body rates
+        command = (
+            7,
+            [*(QUATERNION_TURN * state.quaternion)],
+            *still,
+            self.hover,
+        )  # 7: no body rates
         for _ in range(round(SETTLING / PERIOD)):
             self.link.connection.mav.set_attitude_target_send(0, 1, 1, *command)
             for _ in range(round(PERIOD / STEP)):
@@ -163,6 +167,8 @@ class ArduPilot:
     def close(self) -> None:
         self.process.kill()
         self.process.wait(10.0)
+        self.physics.close()
+        self.link.connection.close()
         shutil.rmtree(self.folder)
 
 

@@ -18,6 +18,7 @@ POSITION, AUTO, OFFBOARD = 3, 4, 6  # PX4's main modes
 LOITER = 3  # of AUTO
 PERIOD = 10_000  # µs
 TURN = np.array([1.0, -1.0, -1.0])  # half a turn about x, for vectors
+QUATERNION_TURN = np.array([1.0, 1.0, -1.0, -1.0])  # the same, for quaternions
 
 
 class Px4:
@@ -58,7 +59,7 @@ class Px4:
         return State(
             min(place_time, attitude_time),
             TURN * [place.x, place.y, place.z],
-            np.array([attitude.q1, attitude.q2, -attitude.q3, -attitude.q4]),
+            QUATERNION_TURN * [attitude.q1, attitude.q2, attitude.q3, attitude.q4],
             TURN * [place.vx, place.vy, place.vz],
             TURN * [attitude.rollspeed, attitude.pitchspeed, attitude.yawspeed],
         )
