@@ -150,6 +150,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
         substeps: int | None = None,
         cost: Callable[[FlownStates], th.Tensor] = flight_cost,
         calm_coef: float = 0.0,
+        end_at_ground: bool = True,
     ) -> FlightTape:
         """Return a tape that records flights of this environment and differentiates them.
 
@@ -157,6 +158,8 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
         :param substeps: physics steps in a control step of a recording; None: as in :meth:`step`.
         :param cost: the cost of each control step, in PyTorch.
         :param calm_coef: weight of :func:`~sb3_quad.envs.flight_cost.calm_cost`, which is added.
+        :param end_at_ground: False: a crash does not end a recorded flight, which goes on below
+            the ground.
         """
         control_step = self.vehicle.control_step
 
@@ -164,7 +167,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
             return cost(flown) + calm_coef * calm_cost(flown, control_step)
 
         differentiated = partial(cost_and_gradients, with_calm if calm_coef else cost)
-        return FlightTape(self.batch, n_steps, substeps, differentiated)
+        return FlightTape(self.batch, n_steps, substeps, differentiated, end_at_ground)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the given rows, one value per row."""

@@ -22,7 +22,7 @@ from sb3_quad.envs.simulation.adjoint import MOVING
 from sb3_quad.envs.simulation.batch import QuadcopterBatch
 from sb3_quad.envs.simulation.observation import FEATURE_SIZES
 from sb3_quad.envs.simulation.settings import FlightSettings
-from sb3_quad.envs.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
+from sb3_quad.envs.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY, X
 from sb3_quad.envs.simulation.tape import FlightTape
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 from sb3_quad.fast.policy import Perceptrons
@@ -71,7 +71,7 @@ class LinearCost:
         self.observations = np.zeros((steps + 1, n, size), np.float32)
         if observed:
             weights = generator.standard_normal((steps, n, size))
-            acts = np.arange(tape.n_steps)[:, None] < tape.lengths
+            acts = np.arange(tape.n_steps)[:, None] < tape.ends
             self.observations[:-1] = np.where(acts[:, :, None], weights, 0.0)
 
     def __call__(self, states, actions, counts):
@@ -376,6 +376,27 @@ def test_a_lost_row_has_no_gradient_from_there_on_and_disturbs_no_other():
     for row in LOST:
         # The last action leads to the crash, which does not count.
         assert not lost[lengths[row] - 1 :, row].any() and lost[: lengths[row] - 1, row].any()
+
+
+def test_below_the_ground_a_crashed_row_has_the_gradient_of_the_whole_recording():
+    steps = 25
+    tape = FlightTape(new_batch(6, 7, **CARRIED), steps, 2, end_at_ground=False)
+    begin(tape)
+    doomed(tape.batch)
+    # The last row crashes, then leaves the range.
+    state = tape.batch.state
+    height = state[X.target + 2, 5]
+    state[POSITION, 5] = state[X.target : X.target + 3, 5]
+    state[POSITION, 5] += [np.sqrt(29.8**2 - height**2), 0.0, 0.3 - height]
+    state[VELOCITY, 5] = [2.0, 0.0, -3.0]
+    tape.batch.observe()
+    gradient = record_and_compare(tape, random_actions(steps, 6, 0), 1)
+    assert np.flatnonzero(tape.lost).tolist() == [*LOST, 5]
+    crashed, left = LOST
+    assert tape.states[-1, X.position + 2, crashed] < 0.0 and tape.lengths[crashed] < steps
+    assert gradient[:, crashed].any(axis=1).all()
+    assert not gradient[tape.lengths[left] - 1 :, left].any()
+    assert tape.lengths[5] < tape.ends[5] < steps
 
 
 def test_flights_that_carry_on_have_the_gradient_of_what_follows():

@@ -172,6 +172,17 @@ def test_lost_flights_are_pulled_to_the_expert_and_others_are_not(monkeypatch):
         np.testing.assert_allclose(old - new, expected, rtol=1e-3, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.parametrize("end_at_ground", [True, False])
+def test_recordings_end_at_the_ground_unless_told_otherwise(end_at_ground):
+    env = QuadcopterVecEnv(8, task="state_recovery", seed=0)
+    agent = APG("MlpPolicy", env, n_steps=220, end_at_ground=end_at_ground, seed=0)
+    agent.learn(8 * 220)
+    tape = agent._tape
+    assert tape.lost.any()
+    lost_later = tape.ends[tape.lost] > tape.lengths[tape.lost]
+    assert lost_later.any() != end_at_ground
+
+
 @pytest.mark.parametrize("n_envs", [8, 160])
 def test_the_log_has_all_flights_of_an_update(n_envs):
     """Here only the first ones are lost, by a noise that makes the agent blind."""

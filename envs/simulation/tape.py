@@ -62,13 +62,16 @@ class FlightTape:
     Record with :meth:`reset` and a :meth:`step` for each control step. Then call :meth:`begin`, and
     :meth:`backward` for each step, the last one first.
 
-    A row that crashes or leaves the range costs nothing from there on and has no gradient.
+    A row that crashes or leaves the range costs nothing from there on and has no gradient, unless
+    recordings go on below the ground.
 
     :param batch: the batch that flies. No time limit ends an episode within a recording.
     :param n_steps: control steps of a recording.
     :param substeps: physics steps in a control step; None: those of the batch. Two take half the
         time of four, and differ little.
     :param cost: the cost that :meth:`begin` takes unless it is given another.
+    :param end_at_ground: whether a row ends where it crashes. If not, it counts as lost there, but
+        flies on below the ground, and only leaving the range ends it.
     """
 
     def __init__(
@@ -77,6 +80,7 @@ class FlightTape:
         n_steps: int,
         substeps: int | None = None,
         cost: FlightCost | None = None,
+        end_at_ground: bool = True,
     ) -> None:
         if FEATURE_SIZES.keys() != DIFFERENTIATED:
             names = ", ".join(FEATURE_SIZES.keys() - DIFFERENTIATED)
@@ -88,6 +92,7 @@ class FlightTape:
         self.batch = batch
         self.n_steps = n_steps
         self._cost = cost
+        self._end_at_ground = end_at_ground
         # The states before each control step and after the last one
         self.states = np.zeros((n_steps + 1, STATE_SIZE, n))
         self.actions = np.zeros((n_steps, n, 4), np.float32)
@@ -95,6 +100,9 @@ class FlightTape:
         # Control steps that each row has flown, and whether it crashed or left the range then
         self.lengths = np.full(n, n_steps)
         self.lost = np.zeros(n, np.bool_)
+        # Control steps until each row ends, after which it has no cost, and whether it did
+        self.ends = self.lengths.copy()
+        self.ended = np.zeros(n, np.bool_)
         self._integrals = np.zeros((n_steps, *batch.integral.shape))
         self._estimates = np.zeros((n_steps, *batch.estimate.shape))
         self._wrenches = np.zeros((n_steps, *batch.wrench.shape))
@@ -125,6 +133,8 @@ class FlightTape:
         self._queue = batch.queue.copy()
         self.lengths[:] = self.n_steps
         self.lost[:] = False
+        self.ends[:] = self.n_steps
+        self.ended[:] = False
         return observations
 
     def step(self, actions: Float32Array) -> Float32Array:
@@ -151,15 +161,20 @@ class FlightTape:
             self.lost |= newly_lost
             # Their episodes are over for later recordings, too, and for those of a resumed run.
             batch.limits[newly_lost] = 0
+        ends = ~batch.outcome["truncated"] & ~self.ended
+        if not self._end_at_ground:
+            ends &= batch.outcome["out_of_range"] | ~batch.outcome["collision"]
+        self.ends[ends] = self._at
+        self.ended |= ends
         return observations
 
     @property
     def counts(self) -> BoolArray:
         """Whether the state after each control step counts, (n_steps, n).
 
-        The state that a crash ends in does not: it lies outside the model.
+        The state that a row ends in does not: after a crash it lies outside the model.
         """
-        return (np.arange(1, self.n_steps + 1)[:, None] < self.lengths) | ~self.lost
+        return (np.arange(1, self.n_steps + 1)[:, None] < self.ends) | ~self.ended
 
     def episodes(self) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return the sum of each row's rewards, its length, and whether it was lost, (n,) each."""
@@ -194,7 +209,7 @@ class FlightTape:
             step_vjp,
             batch.helpers,
             step,
-            self.lengths,
+            self.ends,
             self.states,
             self.actions,
             self._queue,

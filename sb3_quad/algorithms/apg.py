@@ -54,7 +54,8 @@ class Tape(Protocol):
     """Records flights of n environments, and carries gradients back through their steps.
 
     An environment that ``APG`` can train on has ``record(n_steps, substeps)``, which returns one.
-    Where ``APG`` is given a ``cost`` or a ``calm_coef``, ``record`` gets it by that keyword.
+    Where ``APG`` is given a ``cost``, a ``calm_coef`` or ``end_at_ground=False``, ``record`` gets
+    it by that keyword.
     To record, call :meth:`reset`, then :meth:`step` once for each step. For the backward pass, call
     :meth:`begin`, then :meth:`backward` once for each step, the last one first.
     """
@@ -131,6 +132,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         (DAgger), or fly short windows with ``continue_flights``.
     :param continue_flights: Let each update continue the flights of the one before. A flight that
         crashed or reached its time limit begins again.
+    :param end_at_ground: Whether a flight that crashes ends there. It then has no gradient that
+        says how to save it. False: it counts as lost, but the recording goes on below the ground,
+        where the cost grows with the depth; for vehicles that need most of their height to recover.
     :param cost: The cost of each control step, (steps, n), as a function of what the environment
         records, in PyTorch; in ours, of :class:`~sb3_quad.envs.flight_cost.FlownStates`. It is not
         saved: give it to ``load`` as well. None: the environment's own, which is
@@ -185,6 +189,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         initial_policy: BaseAlgorithm | StrPath | None = None,
         max_row_ratio: Annotated[float, Field(ge=1.0)] | None = 10.0,
         continue_flights: bool = False,
+        end_at_ground: bool = True,
         cost: Callable[[Any], th.Tensor] | None = None,
         calm_coef: Weight = 0.0,
         expert: ExpertLike | None = None,
@@ -216,6 +221,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         )
         self.max_row_ratio = max_row_ratio
         self.continue_flights = continue_flights
+        self.end_at_ground = end_at_ground
         self.cost = cost
         self.own_cost = False
         self.calm_coef = calm_coef
@@ -298,7 +304,9 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             options["cost"] = self.cost
         if self.calm_coef:
             options["calm_coef"] = self.calm_coef
-        # The user's own environment may know neither.
+        if not self.end_at_ground:
+            options["end_at_ground"] = False
+        # The user's own environment may know none of them.
         unfit = f"{type(env).__name__}: does not record with {[*options]}"
         with raised_as(ConfigError, unfit):
             self._tape = env.record(self.n_steps, self.substeps, **options)
