@@ -158,7 +158,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
         :param substeps: physics steps in a control step of a recording; None: as in :meth:`step`.
         :param cost: the cost of each control step, in PyTorch.
         :param calm_coef: weight of :func:`~sb3_quad.envs.flight_cost.calm_cost`, which is added.
-        :param end_at_ground: False: a crash does not end a recorded flight, which goes on below
+        :param end_at_ground: False: a crash does not end a recorded flight, which continues below
             the ground.
         """
         control_step = self.vehicle.control_step

@@ -63,7 +63,7 @@ class FlightTape:
     :meth:`backward` for each step, the last one first.
 
     A row that crashes or leaves the range costs nothing from there on and has no gradient, unless
-    recordings go on below the ground.
+    recordings continue below the ground.
 
     :param batch: the batch that flies. No time limit ends an episode within a recording.
     :param n_steps: control steps of a recording.

@@ -133,7 +133,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     :param continue_flights: Let each update continue the flights of the one before. A flight that
         crashed or reached its time limit begins again.
     :param end_at_ground: Whether a flight that crashes ends there. It then has no gradient that
-        says how to save it. False: it counts as lost, but the recording goes on below the ground,
+        says how to save it. False: it counts as lost, but the recording continues below the ground,
         where the cost grows with the depth; for vehicles that need most of their height to recover.
     :param cost: The cost of each control step, (steps, n), as a function of what the environment
         records, in PyTorch; in ours, of :class:`~sb3_quad.envs.flight_cost.FlownStates`. It is not
