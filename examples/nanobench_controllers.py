@@ -129,11 +129,11 @@ def fly(policy, plant, seen, mean, std):
         state[:MOVING] = state[:MOVING].clip(-LIMITS, LIMITS)
         state[6:MOVING] /= np.linalg.norm(state[6:MOVING])
         state[MOVING:] = logged[MOVING:]
-        error = np.linalg.norm(state[:3] - logged[:3])
+        error = float(np.linalg.norm(state[:3] - logged[:3]))
         if not error <= LOST:
             break
         errors.append(error)
-    return np.sqrt(np.mean(np.square(errors))), len(errors) / len(seen)
+    return float(np.sqrt(np.mean(np.square(errors)))), len(errors) / len(seen)
 
 
 @th.no_grad()
