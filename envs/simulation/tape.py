@@ -100,9 +100,8 @@ class FlightTape:
         # Control steps that each row has flown, and whether it crashed or left the range then
         self.lengths = np.full(n, n_steps)
         self.lost = np.zeros(n, np.bool_)
-        # Control steps until each row ends, after which it has no cost, and whether it did
-        self.ends = self.lengths.copy()
-        self.ended = np.zeros(n, np.bool_)
+        # The control step that each row ends with; after the recording: it does not
+        self.ends = np.full(n, n_steps + 1)
         self._integrals = np.zeros((n_steps, *batch.integral.shape))
         self._estimates = np.zeros((n_steps, *batch.estimate.shape))
         self._wrenches = np.zeros((n_steps, *batch.wrench.shape))
@@ -133,8 +132,7 @@ class FlightTape:
         self._queue = batch.queue.copy()
         self.lengths[:] = self.n_steps
         self.lost[:] = False
-        self.ends[:] = self.n_steps
-        self.ended[:] = False
+        self.ends[:] = self.n_steps + 1
         return observations
 
     def step(self, actions: Float32Array) -> Float32Array:
@@ -161,11 +159,10 @@ class FlightTape:
             self.lost |= newly_lost
             # Their episodes are over for later recordings, too, and for those of a resumed run.
             batch.limits[newly_lost] = 0
-        ends = ~batch.outcome["truncated"] & ~self.ended
+        ends = ~batch.outcome["truncated"]
         if not self._end_at_ground:
             ends &= batch.outcome["out_of_range"] | ~batch.outcome["collision"]
-        self.ends[ends] = self._at
-        self.ended |= ends
+        self.ends[ends] = np.minimum(self.ends[ends], self._at)
         return observations
 
     @property
@@ -174,7 +171,7 @@ class FlightTape:
 
         The state that a row ends in does not: after a crash it lies outside the model.
         """
-        return (np.arange(1, self.n_steps + 1)[:, None] < self.ends) | ~self.ended
+        return np.arange(1, self.n_steps + 1)[:, None] < self.ends
 
     def episodes(self) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Return the sum of each row's rewards, its length, and whether it was lost, (n,) each."""

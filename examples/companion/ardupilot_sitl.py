@@ -29,6 +29,7 @@ from via_px4 import MAV, QUATERNION_TURN, TURN, Px4
 from sb3_quad.envs.vehicles.vehicle import load_vehicle
 
 GUIDED = 4  # a mode
+NO_BODY_RATES = 7  # of an attitude target, a mask
 ANYWAY = 21196  # arm whatever the checks say
 LINK = "127.0.0.1:14550"
 PHYSICS = ("127.0.0.1", 9002)
@@ -153,12 +154,8 @@ class ArduPilot:
         still = np.zeros(3)
         self.velocity = still
         held = State(0.0, state.position, state.quaternion, still, still)
-        command = (
-            7,
-            [*(QUATERNION_TURN * state.quaternion)],
-            *still,
-            self.hover,
-        )  # 7: no body rates
+        attitude = [*(QUATERNION_TURN * state.quaternion)]
+        command = (NO_BODY_RATES, attitude, *still, self.hover)
         for _ in range(round(SETTLING / PERIOD)):
             self.link.connection.mav.set_attitude_target_send(0, 1, 1, *command)
             for _ in range(round(PERIOD / STEP)):
