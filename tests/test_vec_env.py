@@ -208,6 +208,29 @@ def test_terminal_observations_are_rows_own_and_stay():
     np.testing.assert_array_equal(np.array([info["terminal_observation"] for info in infos]), kept)
 
 
+def test_infos_say_the_same_whenever_somebody_looks():
+    at_once, later = (
+        QuadcopterVecEnv(20, "state_recovery", seed=0, max_episode_steps=25) for _ in range(2)
+    )
+    first, last = [], []
+    for env in (at_once, later):
+        env.reset()
+    for _ in range(60):
+        infos = at_once.step(np.zeros((20, 4)))[3]
+        first.append([infos[row] for row in (*range(1, 20), -20)])
+        last.append(later.step(np.zeros((20, 4)))[3])
+    for looked, infos in zip(first, last, strict=True):
+        assert infos[19] is infos[-1] is [*infos][19]
+        for info, same in zip(looked, [*infos[1:], infos[0]], strict=True):
+            assert info.keys() == same.keys()
+            assert info.get("episode", {}).get("r") == same.get("episode", {}).get("r")
+            assert info.get("distance") == same.get("distance")
+            np.testing.assert_array_equal(
+                info.get("terminal_observation"), same.get("terminal_observation")
+            )
+    assert sum(bool(info) for looked in first for info in looked) >= 40
+
+
 def test_out_of_range_ends():
     env = QuadcopterVecEnv(2, noise=0.0, seed=0)
     env.reset()
