@@ -1,11 +1,13 @@
 """What a run hands over, by its evaluations."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from sb3_quad.training.config import TrainingJob, load_config
 from sb3_quad.training.hand_over import hand_over
-from sb3_quad.training.rivals import with_vehicle
+from sb3_quad.training.rivals import Flown, with_vehicle
 from sb3_quad.training.runs import RunFolder
 
 GOOD, BETTER, RUINED = (mean + np.linspace(-0.5, 0.5, 8) for mean in (-1.0, -0.8, -20.0))
@@ -59,3 +61,34 @@ def test_without_evaluations_the_last_agent_is_handed_over(tmp_path):
 def test_rivals_fly_where_a_vehicle_is_given(changes, flies):
     config = load_config("apg", "QuadStateRecovery-v0", None, {"env_kwargs": changes})
     assert with_vehicle(TrainingJob(config=config)) == flies
+
+
+@pytest.mark.parametrize(
+    ("lost", "missed", "reward", "is_behind"),
+    [
+        (0, 0, GOOD, False),
+        (0, 0, GOOD - 0.1, True),
+        (4, 4, BETTER, True),
+        (-1, -1, RUINED, False),
+        (0, 4, GOOD, True),
+        (0, 4, LUCK, True),
+        (0, 4, BETTER, False),
+        (1, 1, GOOD, False),
+    ],
+)
+def test_who_loses_or_misses_more_is_behind(lost, missed, reward, is_behind):
+    def flown(lost, missed, reward):
+        flights = np.arange(100)
+        return Flown(
+            "agent",
+            SimpleNamespace(
+                survival=flights >= 10 + lost,
+                success=flights >= 10 + missed,
+                reward=reward,
+            ),
+        )
+
+    other = flown(0, 0, GOOD)
+    assert flown(lost, missed, reward).is_behind(other) == is_behind
+    if is_behind:
+        assert not other.is_behind(flown(lost, missed, reward))

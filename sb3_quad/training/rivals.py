@@ -23,7 +23,9 @@ from sb3_quad.training.hand_over import is_below
 
 EPISODES = 60  # of each task
 TOLERANCE = 0.1  # m, of the settling time
-LOST = 0.02  # One that loses this share of the flights more is behind, whatever the others earn.
+# One that loses this share of the flights more is behind, whatever it earns; one that misses this
+# share of the targets more is, unless it earns more.
+LOST = 0.02
 # Training continues from the agent of the stage before, whose network is smaller and learns faster,
 # unless it earns this share less than another one.
 HEAD_START = 0.2
@@ -40,14 +42,19 @@ class Flown(NamedTuple):
     job: TrainingJob | None = None
 
     def is_behind(self, other: "Flown", margin: float = 0.0) -> bool:
-        """Whether it loses more flights, or earns less on the same episodes beyond chance.
+        """Whether it loses more flights, misses more targets without earning more, or earns less;
+        rewards on the same episodes, beyond chance.
 
         :param margin: the share of the other's mean reward that it may earn less.
         """
-        lost = other.flights.survival.mean() - self.flights.survival.mean()
-        rewards = other.flights.reward
-        least = rewards - margin * abs(rewards.mean())
-        return bool(lost >= LOST or (lost >= 0.0 and is_below(self.flights.reward, least)))
+        flights, others = self.flights, other.flights
+        lost = others.survival.mean() - flights.survival.mean()
+        if lost >= LOST or lost < 0.0:
+            return bool(lost > 0.0)
+        least = others.reward - margin * abs(others.reward.mean())
+        missed = others.success.mean() - flights.success.mean()
+        earns_more = is_below(others.reward, flights.reward)
+        return is_below(flights.reward, least) or bool(missed >= LOST and not earns_more)
 
     def __str__(self) -> str:
         flights = self.flights
