@@ -6,8 +6,9 @@
 Rates are control steps of 10 ms per CPU second, so other programs hardly matter. Ours observe with
 noise, reward and begin episodes again; the others only move their vehicles.
 
-A training starts from nothing and ends when it reaches its last goal, or after 600 CPU seconds.
-Goals are shares of 960 fresh recoveries that succeed; to fly them takes no part of the time.
+A training starts from nothing and ends when it reaches its last goal, at the end of its recipe, or
+after 600 CPU seconds. Goals are shares of 960 fresh recoveries that succeed; to fly them takes no
+part of the time.
 """
 
 import argparse
@@ -125,6 +126,7 @@ def train(learn):
         began = process_time()
         rollouts = 0
         best = 0.0
+        spent = 0.0
         reached: dict[float, float] = {}
 
         def _on_step(self):
@@ -139,17 +141,18 @@ def train(learn):
             self.evaluate()
 
         def evaluate(self):
-            spent = process_time() - self.began
+            self.spent = process_time() - self.began
             share = float(fly(self.model, "state_recovery", 960, seed=5).success.mean())
             self.best = max(self.best, share)
             for goal in GOALS:
                 if share >= goal:
-                    self.reached.setdefault(goal, round(spent))
-            self.began = process_time() - spent
+                    self.reached.setdefault(goal, round(self.spent))
+            self.began = process_time() - self.spent
 
     watch = Watch()
     learn(watch)
-    return f"{watch.reached} CPU s, {watch.best:.2%} at best, {watch.num_timesteps:,} timesteps"
+    ended = f"{watch.num_timesteps:,} timesteps in {watch.spent:.0f} CPU s"
+    return f"{watch.reached} CPU s, {watch.best:.2%} at best, {ended}"
 
 
 SUBJECTS = {
