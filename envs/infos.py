@@ -12,8 +12,8 @@ from sb3_quad.base.types import Float32Array, StrDict
 class Ended(NamedTuple):
     """What a step knows of the k rows that have ended, in arrays that no later step changes."""
 
-    rows: npt.NDArray[np.intp]
-    """(k,), ascending"""
+    places: dict[int, int]
+    """of each row, its place in the arrays"""
     outcomes: npt.NDArray[np.void]
     """(k,) of ``OUTCOME``"""
     observations: Float32Array
@@ -21,8 +21,9 @@ class Ended(NamedTuple):
     elapsed: float
     """s since the environment was made"""
 
-    def info(self, k: int) -> StrDict:
-        """Return the info of the k-th of them."""
+    def info(self, row: int) -> StrDict:
+        """Return the info of one of these rows."""
+        k = self.places[row]
         total, _, length, distance, collision, out_of_range, truncated, success = (
             self.outcomes.item(k)
         )
@@ -51,10 +52,8 @@ class Infos(list[Any]):
     def _write(self, row: int) -> StrDict:
         """Write the info of a row."""
         info: StrDict = {}
-        if self._ended is not None:
-            k = int(self._ended.rows.searchsorted(row))
-            if k < len(self._ended.rows) and self._ended.rows[k] == row:
-                info = self._ended.info(k)
+        if self._ended is not None and row in self._ended.places:
+            info = self._ended.info(row)
         self[row] = info
         return info
 
@@ -65,12 +64,11 @@ class Infos(list[Any]):
         return self._write(row % len(self)) if info is None else info
 
     def __iter__(self) -> Iterator[StrDict]:
-        written = [*super().__iter__()]
         if self._ended is not None:
-            for k, row in enumerate(self._ended.rows.tolist()):
-                if written[row] is None:
-                    written[row] = self._ended.info(k)
-        self[:] = [{} if info is None else info for info in written]
+            for row in self._ended.places:
+                if super().__getitem__(row) is None:
+                    self._write(row)
+        self[:] = [{} if info is None else info for info in super().__iter__()]
         return super().__iter__()
 
     def __eq__(self, other: object) -> bool:

@@ -119,8 +119,9 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds, BatchVecEnv):
         ended = None
         if rows.size:
             elapsed = round(time.time() - self._start, 6)
+            places = {row: k for k, row in enumerate(rows.tolist())}
             last = self.batch.last_observations[rows]
-            ended = Ended(rows, self.batch.outcome[rows], last, elapsed)
+            ended = Ended(places, self.batch.outcome[rows], last, elapsed)
         return observations, rewards, dones, Infos(self._nothing, ended)
 
     def record(
