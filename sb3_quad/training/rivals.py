@@ -49,8 +49,10 @@ class Flown(NamedTuple):
         """
         flights, others = self.flights, other.flights
         lost = others.survival.mean() - flights.survival.mean()
-        if lost >= LOST or lost < 0.0:
-            return bool(lost > 0.0)
+        if lost >= LOST:
+            return True
+        if lost < 0.0:
+            return False
         least = others.reward - margin * abs(others.reward.mean())
         missed = others.success.mean() - flights.success.mean()
         earns_more = is_below(others.reward, flights.reward)
