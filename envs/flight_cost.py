@@ -8,7 +8,7 @@ import torch as th
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
 from sb3_quad.envs.simulation.reward import CALM_CHANGE, CALM_DISTANCE
-from sb3_quad.envs.simulation.state import STATE
+from sb3_quad.envs.simulation.state import REFERENCE, REFERENCE_PARTS, REFERENCE_SIZE, STATE
 
 # Distances, m, at which the coarse and the fine term of the position reach half of their limit.
 COARSE, FINE = 0.5, 0.05
@@ -72,10 +72,19 @@ def cost_and_gradients(
 
     :raises ConfigError: the cost is not a tensor (steps, n) that depends on states or actions.
     """
-    state_tensor = th.from_numpy(states).requires_grad_()
+    # Flights do not change the reference, the last rows.
+    flown, reference = th.split(th.from_numpy(states), [REFERENCE.start, REFERENCE_SIZE], dim=1)
+    flown.requires_grad_()
     action_tensor = th.from_numpy(actions).double().requires_grad_()
     # Split once: for each slice, autograd would add up an array of all states.
-    parts = [part.transpose(1, 2) for part in th.split(state_tensor, [*STATE.values()], dim=1)]
+    sizes = [*STATE.values()][: -len(REFERENCE_PARTS)]
+    parts = [
+        part.transpose(1, 2)
+        for part in (
+            *th.split(flown, sizes, dim=1),
+            *th.split(reference, [*REFERENCE_PARTS.values()], dim=1),
+        )
+    ]
     costs = cost(FlownStates._make([*parts, action_tensor]))
     shape = tuple(counts.shape)
     if not isinstance(costs, th.Tensor) or costs.shape != shape or not costs.requires_grad:
@@ -86,7 +95,7 @@ def cost_and_gradients(
         )
     mean = th.where(th.from_numpy(counts), costs, 0.0).mean()
     gradients = th.autograd.grad(
-        mean, (state_tensor, action_tensor), allow_unused=True, materialize_grads=True
+        mean, (flown, action_tensor), allow_unused=True, materialize_grads=True
     )
     return mean.item(), gradients[0].numpy(), gradients[1].numpy()
 

@@ -51,8 +51,8 @@ from sb3_quad.envs.simulation.threads import DONE, LEFT, finish, share_out
 
 FlightCost = Callable[[FloatArray, Float32Array, BoolArray], tuple[float, FloatArray, FloatArray]]
 """A function of the states after each step (steps, STATE_SIZE, n), the actions (steps, n, 4), and
-whether each counts (steps, n). It returns the mean cost, its gradient with respect to the states,
-and that with respect to the actions.
+whether each counts (steps, n). It returns the mean cost, its gradient with respect to the first
+MOVING rows of the states, or to all, and that with respect to the actions.
 """
 
 
@@ -153,16 +153,16 @@ class FlightTape:
         observations, self.rewards[t], _ = batch.step_on(actions, self.substeps)
         self._at = t + 1
         self.states[self._at] = batch.state
-        newly_lost = ~batch.outcome["truncated"] & ~self.lost
+        over = ~batch.outcome["truncated"]
+        newly_lost = over & ~self.lost
         if newly_lost.any():
             self.lengths[newly_lost] = self._at
             self.lost |= newly_lost
             # Their episodes are over for later recordings, too, and for those of a resumed run.
             batch.limits[newly_lost] = 0
-        ends = ~batch.outcome["truncated"]
         if not self._end_at_ground:
-            ends &= batch.outcome["out_of_range"] | ~batch.outcome["collision"]
-        self.ends[ends] = np.minimum(self.ends[ends], self._at)
+            over &= batch.outcome["out_of_range"] | ~batch.outcome["collision"]
+        np.minimum(self.ends, self._at, out=self.ends, where=over)
         return observations
 
     @property

@@ -335,6 +335,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self._compared = []
         self._differences = []
         clones = self.will_clone()
+        # To callbacks, every flight ends with the recording.
+        dones = np.zeros(env.num_envs, np.bool_)
         for step in range(n_rollout_steps):
             actions = self._recorded_policy.forward(step, observations)
             if clones:
@@ -347,9 +349,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 self._compared.append((observations.copy(), actions))
             observations = self._tape.step(actions)
             self.num_timesteps += env.num_envs
-            # To callbacks, every flight ends with the recording.
-            dones = np.full(env.num_envs, step == n_rollout_steps - 1)
-            if dones.all():
+            if step == n_rollout_steps - 1:
+                dones = np.ones(env.num_envs, np.bool_)
                 for info, reward, length, is_lost in zip(
                     infos, *self._tape.episodes(), strict=True
                 ):

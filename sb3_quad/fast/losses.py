@@ -93,7 +93,7 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
     Its gradient with respect to the means is added to ``g``, that with respect to log_std to
     ``g_log_std``.
 
-    :param mean: (a, ROWS), and so is ``g``.
+    :param mean: (rows, a or more), and so is ``g``.
     """
     n = len(index)
     a = len(log_std)
@@ -104,7 +104,7 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
         if loss.bc_coef != 0.0:
             squares = 0.0
             for k in range(a):
-                squares += (mean[k, i] - target[k]) ** 2
+                squares += (mean[i, k] - target[k]) ** 2
             # Written so that NaN passes through.
             if not squares / a >= loss.nearest:
                 share = float(a)
@@ -112,15 +112,15 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
                     share = 1.0
                 weight = loss.bc_coef / n
                 for k in range(a):
-                    error = np.float64(mean[k, i]) - target[k]
+                    error = np.float64(mean[i, k]) - target[k]
                     value, slope, slope_log_std = cloning_error(loss, error, log_std[k])
                     terms[CLONING] += value / share
-                    g[k, i] += float32(weight * slope / share)
+                    g[i, k] += float32(weight * slope / share)
                     g_log_std[k] += weight * slope_log_std
         if loss.policy_coef != 0.0:
             log_prob = 0.0
             for k in range(a):
-                z = (np.float64(target[flown + k]) - mean[k, i]) * math.exp(-log_std[k])
+                z = (np.float64(target[flown + k]) - mean[i, k]) * math.exp(-log_std[k])
                 log_prob -= 0.5 * z * z + log_std[k] + _HALF_LOG_2PI
             change = log_prob - target[flown + a]
             ratio = math.exp(change)
@@ -136,20 +136,20 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
                 slope = -loss.policy_coef / n * advantage * ratio
                 for k in range(a):
                     inverse = math.exp(-log_std[k])
-                    z = (np.float64(target[flown + k]) - mean[k, i]) * inverse
-                    g[k, i] += float32(slope * z * inverse)
+                    z = (np.float64(target[flown + k]) - mean[i, k]) * inverse
+                    g[i, k] += float32(slope * z * inverse)
                     g_log_std[k] += slope * (z * z - 1.0)
 
 
 @inner
 def critic_loss(value, index, first, count, targets, loss, g, terms):
-    """Add a critic's loss for values (1, ROWS), as :func:`actor_loss` does."""
+    """Add a critic's loss for values (rows, 1 or more), as :func:`actor_loss` does."""
     n = len(index)
     for i in range(count):
         target = targets[index[first + i]]
         old = np.float64(target[0])
         goal = np.float64(target[1])
-        now = np.float64(value[0, i])
+        now = np.float64(value[i, 0])
         error = now - goal
         slope = 1.0
         if math.isfinite(loss.clip_range_vf):
@@ -160,4 +160,4 @@ def critic_loss(value, index, first, count, targets, loss, g, terms):
                 error = clipped
                 slope = 1.0 if bounded == change else 0.0
         terms[VALUE] += error * error
-        g[0, i] += float32(loss.vf_coef / n * 2.0 * error * slope)
+        g[i, 0] += float32(loss.vf_coef / n * 2.0 * error * slope)

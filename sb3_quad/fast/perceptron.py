@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch as th
@@ -13,16 +13,17 @@ from torch import nn
 from sb3_quad.algorithms.buffers import Batch
 from sb3_quad.base.types import AnyArray, Float32Array, FloatArray
 from sb3_quad.fast.kernel import (
-    FEW,
     LINEAR,
     RELU,
     ROWS,
     TANH,
     Layers,
-    for_blocks,
+    forward,
     gradient,
+    pullback,
 )
 from sb3_quad.fast.losses import TERMS, Numbers
+from sb3_quad.fast.tiles import HEIGHT
 
 # A mini-batch is cut into at most this many chunks. Their sums are added up in order, so that
 # results do not depend on the number of threads, to the bit.
@@ -34,8 +35,6 @@ PARTS = 4
 # Bytes; vectors that straddle two cache lines take a third longer.
 CACHE_LINE = 64
 _ACTIVATIONS = {nn.Tanh: TANH, nn.ReLU: RELU}
-# The compiled passes, by rows per block.
-_PASSES = {size: for_blocks(size) for size in (FEW, ROWS)}  # type: ignore[no-untyped-call]
 _NONE = np.empty(0)
 _NOT_KEPT = np.empty((0, 0), np.float32)
 
@@ -49,30 +48,35 @@ class Perceptron:
     def __init__(self, modules: Sequence[nn.Module]) -> None:
         self._linear: list[Any] = [*modules[::2]]
         kinds = np.array([*(_ACTIVATIONS[type(layer)] for layer in modules[1::2]), LINEAR])
-        # Widths are padded to multiples of 4.
         sizes = [self._linear[0].in_features, *(layer.out_features for layer in self._linear)]
-        widths = np.array([-(-size // 4) * 4 for size in sizes])
+        widths = np.array([_padded(size) for size in sizes])
         self._units = int(widths.sum())
         self._scratch_size = (self._units + 2 * int(widths.max())) * ROWS
         self._size = int((widths[1:] * (widths[:-1] + 1)).sum())
-        packed = np.zeros(self._size, np.float32)
-        self._layers = Layers(widths, kinds, packed)
-        # Views of ``packed``, each with the view of PyTorch's memory that :meth:`pack` copies into
-        # it
+        parameters, weights = (_aligned(self._size) for _ in range(2))
+        for packed in (parameters, weights):
+            packed.fill(0.0)
+        self._layers = Layers(widths, kinds, parameters, weights)
+        # Views of those, each with the view of PyTorch's memory that :meth:`pack` copies into it
         own = [parameter.detach().numpy() for parameter in self.parameters()]
-        self._copies = [*zip(self._views(packed), own, strict=True)]
+        self._copies = [*zip(self._views(parameters), own, strict=True)]
+        transposed = [*zip(self._views(weights, "C"), own, strict=True)]
+        self._copies_backward = self._copies + transposed[::2]
 
-    def _views(self, packed: Float32Array) -> list[Float32Array]:
-        """Return the views of :meth:`parameters` in an array of all layers' parameters."""
+    def _views(self, packed: Float32Array, order: Literal["F", "C"] = "F") -> list[Float32Array]:
+        """Return the views of :meth:`parameters` in an array of all layers' parameters.
+
+        :param order: ``"F"``: weights lie as in ``Layers.parameters``; ``"C"``: ``Layers.weights``.
+        """
         views: list[Float32Array] = []
         start = 0
         for i, layer in enumerate(self._linear):
-            columns, rows = self._layers.widths[i : i + 2].tolist()
-            middle = start + rows * columns
-            weights = packed[start:middle].reshape(rows, columns)
+            inputs, outputs = self._layers.widths[i : i + 2].tolist()
+            middle = start + inputs * outputs
+            weights = packed[start:middle].reshape(outputs, inputs, order=order)
             views.append(weights[: layer.out_features, : layer.in_features])
             views.append(packed[middle : middle + layer.out_features])
-            start = middle + rows
+            start = middle + outputs
         return views
 
     @staticmethod
@@ -96,9 +100,12 @@ class Perceptron:
                 return False
         return len(modules) % 2 == 1
 
-    def pack(self) -> None:
-        """Copy the current parameters, for calls that keep activations."""
-        for packed, parameter in self._copies:
+    def pack(self, backward: bool = True) -> None:
+        """Copy the current parameters, for calls that keep activations.
+
+        :param backward: also copy what the backward pass needs.
+        """
+        for packed, parameter in self._copies_backward if backward else self._copies:
             packed[...] = parameter
 
     def __call__(
@@ -110,10 +117,9 @@ class Perceptron:
             then uses the parameters of the last :meth:`pack`, otherwise the current ones.
         """
         if activations is _NOT_KEPT:
-            self.pack()
+            self.pack(backward=False)
         n = len(observations)
         out = np.empty((n, self._linear[-1].out_features), np.float32)
-        forward, _ = _PASSES[_block_rows(n)]
         self._compute(forward, n, _flat(observations), np.arange(n), out, activations)
         return out
 
@@ -141,9 +147,8 @@ class Perceptron:
 
         :return: memory for the activations, (calls, ...), and for the sums of all calls.
         """
-        rows = _block_rows(n)
-        blocks = -(-n // rows)
-        size = self._units * rows
+        blocks = -(-n // ROWS)
+        size = self._units * min(ROWS, _padded(n))
         activations = _aligned(calls * blocks * size).reshape(calls, blocks, size)
         return activations, np.empty((_chunks(n), self._size), np.float32)
 
@@ -158,7 +163,6 @@ class Perceptron:
         """
         n = len(grad_outputs)
         grad_inputs = np.empty((n, self._linear[0].in_features), np.float32)
-        _, pullback = _PASSES[_block_rows(n)]
         self._compute(pullback, n, activations, np.arange(n), grad_outputs, grad_inputs, sums)
         return grad_inputs
 
@@ -166,7 +170,7 @@ class Perceptron:
         """Set ``.grad`` of all parameters, given sums (chunks, size); return their sum."""
         total = sums.sum(axis=0)
         for parameter, view in zip(self.parameters(), self._views(total), strict=True):
-            parameter.grad = th.from_numpy(view).contiguous()
+            parameter.grad = th.from_numpy(np.ascontiguousarray(view))
         return th.from_numpy(total)
 
     def parameters(self) -> list[nn.Parameter]:
@@ -206,8 +210,8 @@ def _flat(observations: AnyArray) -> Float32Array:
     return np.ascontiguousarray(observations, dtype=np.float32).reshape(len(observations), -1)
 
 
-def _block_rows(n: int) -> int:
-    return FEW if n <= FEW else ROWS
+def _padded(size: int) -> int:
+    return -(-size // HEIGHT) * HEIGHT
 
 
 def _chunks(n: int) -> int:

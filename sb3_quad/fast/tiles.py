@@ -9,54 +9,104 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-HEIGHT, WIDTH = 4, 16
-"""Size of a tile: eight registers of 256 bits, so that eight more are left for factors."""
-_VECTOR = ir.VectorType(ir.FloatType(), WIDTH)
+from sb3_quad.base.compiled import inner
+
+HEIGHT = 4
+"""Rows of a tile; matrices have a multiple of it as rows and as columns."""
+_WIDTH = 16
+# Terms of a sum in one go, so that what a column of tiles reads stays in the L1 cache
+_TERMS = 256
 _FIRST = ir.IntType(32)(0)
-_ALL_THE_FIRST = ir.Constant(ir.VectorType(_FIRST.type, WIDTH), [0] * WIDTH)
 _FUSED = {"flags": ("contract",)}
 
 
-@intrinsic
-def add_to_tile(
-    typing_context: Any, w: Any, x: Any, h: Any, j: Any, i: Any, first: Any, last: Any
-) -> Any:
-    """Add ``w[:, first:last] @ x[first:last]`` to the tile of ``h`` that begins at row j, column i.
+def _tile(width: int, chains: int) -> Any:
+    """Return a compiled function for tiles of ``width`` columns.
 
-    All are float32 matrices, and neighbouring columns of x and h are neighbours in memory. If
-    ``first`` is 0, the product replaces what was there.
+    A processor is busy with eight sums at a time, and has eight more registers for factors. A tile
+    of 16 columns fills eight registers of 256 bits; a narrower one has ``chains`` sums for each
+    number, which are added up in the end.
     """
-    signature = types.void(w, x, h, *[types.intp] * 4)
+    vector_type = ir.VectorType(ir.FloatType(), width)
+    all_the_first = ir.Constant(ir.VectorType(_FIRST.type, width), [0] * width)
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        kinds = signature.args
-        arrays = [context.make_array(kinds[k])(context, builder, arguments[k]) for k in range(3)]
-        j, i, first, last = arguments[3:]
+    @intrinsic
+    def add_to_tile(
+        typing_context: Any,
+        a: Any,
+        b: Any,
+        c: Any,
+        j: Any,
+        i: Any,
+        first: Any,
+        last: Any,
+        adds: Any,
+    ) -> Any:
+        """Add ``a[:, first:last] @ b[first:last]`` to the tile of ``c`` that begins at row j,
+        column i, or write it there unless ``adds``.
+        """
+        signature = types.void(a, b, c, *[types.intp] * 4, types.boolean)
 
-        def place(k: int, row: Any, column: Any) -> Any:
-            inside = [row, column]
-            return cgutils.get_item_pointer(context, builder, kinds[k], arrays[k], inside)
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            kinds = signature.args
+            arrays = [
+                context.make_array(kinds[k])(context, builder, arguments[k]) for k in range(3)
+            ]
+            j, i, first, last, adds = arguments[3:]
 
-        def vector(k: int, row: Any) -> Any:
-            return builder.bitcast(place(k, row, i), _VECTOR.as_pointer())
+            def place(k: int, row: Any, column: Any) -> Any:
+                inside = [row, column]
+                return cgutils.get_item_pointer(context, builder, kinds[k], arrays[k], inside)
 
-        rows = [builder.add(j, j.type(row)) for row in range(HEIGHT)]
-        begins = builder.icmp_signed("==", first, first.type(0))
-        sums = []
-        for row in rows:
-            before = builder.load(vector(2, row), align=4)
-            before = builder.select(begins, _VECTOR([0.0] * WIDTH), before)
-            sums.append(cgutils.alloca_once_value(builder, before))
-        with cgutils.for_range_slice(builder, first, last, first.type(1)) as (k, _):
-            factor = builder.load(vector(1, k), align=4)
-            for row, total in zip(rows, sums, strict=True):
-                empty = _VECTOR(ir.Undefined)
-                weight = builder.insert_element(empty, builder.load(place(0, row, k)), _FIRST)
-                weights = builder.shuffle_vector(weight, empty, _ALL_THE_FIRST)
-                product = builder.fmul(weights, factor, **_FUSED)
-                builder.store(builder.fadd(builder.load(total), product, **_FUSED), total)
-        for row, total in zip(rows, sums, strict=True):
-            builder.store(builder.load(total), vector(2, row), align=4)
-        return context.get_dummy_value()
+            def vector(k: int, row: Any) -> Any:
+                return builder.bitcast(place(k, row, i), vector_type.as_pointer())
 
-    return signature, generate
+            rows = [builder.add(j, j.type(row)) for row in range(HEIGHT)]
+            zero = vector_type([0.0] * width)
+            sums = [cgutils.alloca_once_value(builder, zero) for _ in range(chains) for _ in rows]
+            with cgutils.for_range_slice(builder, first, last, first.type(chains)) as (start, _):
+                for chain in range(chains):
+                    k = builder.add(start, start.type(chain))
+                    factor = builder.load(vector(1, k), align=4)
+                    for row, total in zip(rows, sums[HEIGHT * chain :], strict=False):
+                        empty = vector_type(ir.Undefined)
+                        number = builder.load(place(0, row, k))
+                        number = builder.insert_element(empty, number, _FIRST)
+                        numbers = builder.shuffle_vector(number, empty, all_the_first)
+                        product = builder.fmul(numbers, factor, **_FUSED)
+                        builder.store(builder.fadd(builder.load(total), product, **_FUSED), total)
+            for n, row in enumerate(rows):
+                before = builder.load(vector(2, row), align=4)
+                result = builder.select(adds, before, zero)
+                for total in sums[n::HEIGHT]:
+                    result = builder.fadd(result, builder.load(total))
+                builder.store(result, vector(2, row), align=4)
+            return context.get_dummy_value()
+
+        return signature, generate
+
+    return add_to_tile
+
+
+_add_to_wide = _tile(_WIDTH, 1)
+_add_to_narrow = _tile(HEIGHT, 2)
+
+
+@inner
+def multiply(a, b, c, adds):
+    """c = a b, or c += a b if ``adds``; float32 matrices.
+
+    Neighbouring columns of b and c are neighbours in memory.
+    """
+    rows = a.shape[0]
+    columns = b.shape[1]
+    wide = columns // _WIDTH * _WIDTH
+    for first in range(0, b.shape[0], _TERMS):
+        last = min(b.shape[0], first + _TERMS)
+        goes_on = adds or first > 0
+        for i in range(0, wide, _WIDTH):
+            for j in range(0, rows, HEIGHT):
+                _add_to_wide(a, b, c, j, i, first, last, goes_on)
+        for i in range(wide, columns, HEIGHT):
+            for j in range(0, rows, HEIGHT):
+                _add_to_narrow(a, b, c, j, i, first, last, goes_on)
