@@ -28,12 +28,11 @@ from sb3_quad.algorithms.common import (
     model_of,
     policy_arguments,
 )
-from sb3_quad.algorithms.labelling import ExpertLike
 from sb3_quad.algorithms.networks import network_of
 from sb3_quad.algorithms.soap import SOAP
 from sb3_quad.base.compiled import compiled
 from sb3_quad.base.errors import ConfigError, TrainingError, raised_as
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray, StrDict, StrPath
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, StrDict, StrPath
 from sb3_quad.base.validate import Count, Weight
 
 # An update is undone if its cost lies this many usual changes above the least so far, or if its
@@ -92,7 +91,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     The equations of motion are known and smooth, so the gradient of a flight's cost with respect to
     the policy's weights can be computed exactly: the flight is recorded, then the derivative is
     carried back through policy, observation, delay, rotors and rigid body. There is no critic and
-    no exploration, and a teacher only if you give one. Related methods are backpropagation through
+    no exploration, and no teacher. Related methods are backpropagation through
     time (Werbos, 1990), SHAC (Xu et al., 2022), which adds a critic to short windows, and Heeg,
     Song and Scaramuzza, "Learning Quadrotor Control From Visual Features Using Differentiable
     Simulation" (2024).
@@ -141,13 +140,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         :func:`~sb3_quad.envs.flight_cost.flight_cost` in ours.
     :param calm_coef: Weight of :func:`~sb3_quad.envs.flight_cost.calm_cost`, which is added to the
         cost: for agents that swing or buzz at the target, such as with slow motors or long delays.
-    :param expert: What the actor imitates in flights that it loses, instead of following their
-        gradient, which does not say how to save them; as in
-        :class:`~sb3_quad.algorithms.ppo_bc.PPOBC`. It is asked at each step, so the tape must fly
-        the environment that gives it the true state.
-    :param lost_bc_coef: Weight of this imitation: a control step of a lost flight costs half of it
-        times the squared difference to the expert's action, a sum over the action's dimensions. For
-        random vehicles try 10 to 60.
     :param substeps: Physics steps per control step during training; None: the vehicle's.
     :raises ConfigError: an argument out of range, or an environment that cannot be differentiated.
     :raises TrainingError: a non-finite gradient, even in a single environment.
@@ -156,14 +148,12 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     policy_aliases = PPO.policy_aliases
     # If they were saved, algorithms with a critic would adopt these placeholders.
     _not_saved = (
-        *("cost", "_tape", "_recorded_policy", "_compared", "_differences"),
+        *("cost", "_tape", "_recorded_policy", "_compared"),
         *("gamma", "gae_lambda", "ent_coef", "vf_coef"),
     )
     _tape: Tape
     # Observations of some recorded steps, and the mean actions there
     _compared: list[tuple[Float32Array, Float32Array]]
-    # Of each recorded step, the mean actions minus the expert's, (n, a); empty without an expert
-    _differences: list[Float32Array]
     # The least cost so far, whose weights are in the optimiser's state; None: the next one
     _least_cost: float | None = None
     _last_cost = 0.0
@@ -192,8 +182,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         end_at_ground: bool = True,
         cost: Callable[[Any], th.Tensor] | None = None,
         calm_coef: Weight = 0.0,
-        expert: ExpertLike | None = None,
-        lost_bc_coef: Weight = 0.0,
         substeps: Count | None = 2,
         _init_setup_model: bool = True,
     ):
@@ -225,8 +213,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         self.cost = cost
         self.own_cost = False
         self.calm_coef = calm_coef
-        self.expert = expert
-        self.lost_bc_coef = lost_bc_coef
         self.substeps = substeps
 
         if _init_setup_model:
@@ -249,8 +235,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 policy.optimizer = SOAP(policy.parameters(), rate, **policy.optimizer_kwargs)
 
     def will_clone(self) -> bool:
-        """Return whether lost flights imitate an expert."""
-        return self.lost_bc_coef > 0.0
+        """Return False: the gradient needs no expert."""
+        return False
 
     def _shows_in_returns(self) -> bool:
         """Return whether the reward says what the cost says."""
@@ -295,10 +281,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
                 " to APG.load(..., cost=...), or own_cost=False for the default"
             )
         self.own_cost = self.cost is not None
-        if self.expert is not None and not self.will_clone():
-            raise ConfigError(
-                "expert: has no effect with lost_bc_coef 0; give a weight, such as 10, or no expert"
-            )
+        if self.expert is not None:
+            raise ConfigError("expert: APG asks none; give it to DAgger or PPOBC")
         options: StrDict = {}
         if self.cost is not None:
             options["cost"] = self.cost
@@ -333,17 +317,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         observations = self._tape.reset(self.continue_flights)
         infos: list[StrDict] = [{} for _ in range(env.num_envs)]
         self._compared = []
-        self._differences = []
-        clones = self.will_clone()
         # To callbacks, every flight ends with the recording.
         dones = np.zeros(env.num_envs, np.bool_)
         for step in range(n_rollout_steps):
             actions = self._recorded_policy.forward(step, observations)
-            if clones:
-                assert self._labeller is not None
-                # A tape may reuse its array, whose labels would be those of the step before.
-                self._labeller.look(observations, np.full(env.num_envs, step == 0))
-                self._differences.append(actions - self._labeller.labels(observations))
             if step % COMPARED == 0:
                 # A tape may write the next step's observations into the same array.
                 self._compared.append((observations.copy(), actions))
@@ -388,19 +365,13 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
         # Autograd adds to gradients that the critic or an earlier update has left.
         optimizer.zero_grad()
-        pulls, lost = self._pulls()
         # The observation after the last step leads to no action.
         grad_observations = np.zeros_like(self._last_obs)
         for step in reversed(range(self.n_steps)):
             grad_actions = self._tape.backward(step, grad_observations)
             if self.max_row_ratio is not None:
                 grad_actions = _limited(grad_actions, float(self.max_row_ratio))
-            if len(lost):
-                grad_actions = grad_actions.copy()
-                grad_actions[lost] = pulls[step]
             grad_observations = self._recorded_policy.backward(step, grad_actions)
-            # Imitation looks at each step by itself.
-            grad_observations[lost] = 0.0
 
         norm = th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
         if not (np.isfinite(cost) and th.isfinite(norm)):
@@ -422,19 +393,6 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
             self._undo(f"a step changed the mean actions by {change:.3g}", history)
         else:
             self._log_update(history | {"n_undone": [self._n_undone]})
-
-    def _pulls(self) -> tuple[Float32Array, IntArray]:
-        """Return the gradient of the imitation with respect to the actions of the flights that were
-        lost, (steps, k, a), and their rows, (k,); without an expert no rows.
-        """
-        if not self._differences:
-            return np.empty(0, np.float32), np.empty(0, np.int64)
-        _, lengths, is_lost = self._tape.episodes()
-        lost = np.flatnonzero(is_lost)
-        counts = np.arange(self.n_steps)[:, None] < lengths[lost]
-        pulls = np.array([step[lost] for step in self._differences]) * counts[..., None]
-        self.logger.record("train/bc_loss", np.square(pulls).sum() / max(counts.sum(), 1))
-        return pulls * np.float32(self.lost_bc_coef / (self.n_steps * len(lengths))), lost
 
     def _cost_rise(self, cost: float) -> float:
         """Return how far an update's cost lies above the least so far, in usual changes.

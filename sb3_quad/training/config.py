@@ -341,9 +341,8 @@ def build_config(
     check_environment(env_id)
     settings = with_absolute_paths(env_id, settings)
     # The default is written out, so that config.yml names the expert. Demonstrations from a file
-    # need none, nor does what imitates in lost flights alone, unless it is to.
-    imitates = "lost_bc_coef" not in parameters or settings.get("lost_bc_coef")
-    needs_expert = takes_expert(algorithm) and imitates and not settings.get("demonstrations")
+    # need none.
+    needs_expert = takes_expert(algorithm) and not settings.get("demonstrations")
     if needs_expert and settings.get("expert") is None:
         settings["expert"] = DEFAULT_EXPERT
 
