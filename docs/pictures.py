@@ -7,8 +7,8 @@ the last that has them.
     make pictures ARGS="starts.png"     # only these
 
 Learning curves are not among them: they need trainings of hours, and the pages say which. The
-commands run in ``build/pictures/``. What is flown there is kept for later calls;
-``build/pictures/finished.txt`` lists these commands. Empty the folder to begin again.
+commands run in ``build/pictures/``, which a call empties first, so that the agents of today fly.
+What several pictures show is flown once.
 """
 
 import argparse
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 BUILD = ROOT / "build/pictures"
-FINISHED = BUILD / "finished.txt"
-KEPT = "evaluate"  # its folders are used by later calls
 
 # Evaluations that several pictures show.
 CHAPTER_4 = """
@@ -175,18 +173,18 @@ def main() -> None:
     unknown = set(options.pictures) - set(PICTURES)
     if unknown:
         parser.error(f"unknown: {', '.join(sorted(unknown))}; there are {', '.join(PICTURES)}")
-    BUILD.mkdir(parents=True, exist_ok=True)
-    FINISHED.touch()
+    shutil.rmtree(BUILD, ignore_errors=True)
+    BUILD.mkdir(parents=True)
+    flown = set()
     for name in options.pictures or PICTURES:
         for words in commands(PICTURES[name]):
             line = shlex.join(words)
-            if line in FINISHED.read_text().splitlines():
+            if line in flown:
                 continue
             print("$", line, flush=True)
             run(words)
-            if words[1] == KEPT:
-                with FINISHED.open("a") as file:
-                    print(line, file=file)
+            if words[1] == "evaluate":
+                flown.add(line)
         options.into.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(BUILD / name, options.into / name)
         print(f"{options.into / name}", flush=True)

@@ -48,7 +48,7 @@ def cloning(net, x, labels, index):
 
 @settings(max_examples=settings().max_examples // 2)
 @given(
-    widths=st.lists(st.integers(1, 70), min_size=2, max_size=5),
+    widths=st.lists(st.integers(1, 70) | st.just(300), min_size=2, max_size=5),
     activation=st.sampled_from([*ACTIVATIONS]),
     rows=st.integers(1, 3000),
     seed=st.integers(0, 2**31),
