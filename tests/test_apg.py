@@ -188,6 +188,10 @@ def test_what_cannot_be_differentiated_is_refused():
     fast = QuadcopterVecEnv(2, randomize={"motor_gain": [10.0, 10.0]}, seed=0)
     with pytest.raises(ConfigError, match="substeps 1: too few for motors"):
         APG("MlpPolicy", fast, n_steps=5, substeps=1).learn(10)
+    taught = APG("MlpPolicy", env, n_steps=5)
+    taught.set_expert("geometric")
+    with pytest.raises(ConfigError, match="expert: APG asks none; give it to DAgger or PPOBC"):
+        taught.learn(10)
 
 
 def test_a_gradient_that_is_not_finite_leaves_the_weights_alone():

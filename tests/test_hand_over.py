@@ -72,7 +72,8 @@ def test_rivals_fly_where_a_vehicle_is_given(changes, flies):
         (-1, -1, RUINED, False),
         (0, 4, GOOD, True),
         (0, 4, LUCK, True),
-        (0, 4, BETTER, False),
+        (0, 4, BETTER, True),
+        (0, -4, RUINED, False),
         (1, 1, GOOD, False),
     ],
 )

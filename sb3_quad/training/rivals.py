@@ -23,8 +23,8 @@ from sb3_quad.training.hand_over import is_below
 
 EPISODES = 60  # of each task
 TOLERANCE = 0.1  # m, of the settling time
-# One that loses this share of the flights more is behind, whatever it earns; one that misses this
-# share of the targets more is, unless it earns more.
+# One that loses this share of the flights more is behind, or that fails in as many more, whatever
+# it earns.
 LOST = 0.02
 # Training continues from the agent of the stage before, whose network is smaller and learns faster,
 # unless it earns this share less than another one.
@@ -42,8 +42,8 @@ class Flown(NamedTuple):
     job: TrainingJob | None = None
 
     def is_behind(self, other: "Flown", margin: float = 0.0) -> bool:
-        """Whether it loses more flights, misses more targets without earning more, or earns less;
-        rewards on the same episodes, beyond chance.
+        """Whether it loses more flights, fails in more, or earns less; rewards on the same
+        episodes, beyond chance.
 
         :param margin: the share of the other's mean reward that it may earn less.
         """
@@ -53,10 +53,11 @@ class Flown(NamedTuple):
             return True
         if lost < 0.0:
             return False
+        failed = others.success.mean() - flights.success.mean()
+        if abs(failed) >= LOST:
+            return bool(failed > 0.0)
         least = others.reward - margin * abs(others.reward.mean())
-        missed = others.success.mean() - flights.success.mean()
-        earns_more = is_below(others.reward, flights.reward)
-        return is_below(flights.reward, least) or bool(missed >= LOST and not earns_more)
+        return is_below(flights.reward, least)
 
     def __str__(self) -> str:
         flights = self.flights
