@@ -7,7 +7,7 @@ import pytest
 
 from sb3_quad.training.config import TrainingJob, load_config
 from sb3_quad.training.hand_over import hand_over
-from sb3_quad.training.rivals import Flown, with_vehicle
+from sb3_quad.training.rivals import TOLERANCE, Flown, with_vehicle
 from sb3_quad.training.runs import RunFolder
 
 GOOD, BETTER, RUINED = (mean + np.linspace(-0.5, 0.5, 8) for mean in (-1.0, -0.8, -20.0))
@@ -93,3 +93,17 @@ def test_who_loses_or_misses_more_is_behind(lost, missed, reward, is_behind):
     assert flown(lost, missed, reward).is_behind(other) == is_behind
     if is_behind:
         assert not other.is_behind(flown(lost, missed, reward))
+
+
+@pytest.mark.parametrize(
+    ("slower", "margin", "is_behind"), [(2.0, 0.2, True), (1.2, 0.2, False), (2.0, 0.0, False)]
+)
+def test_training_does_not_begin_from_who_settles_much_later(slower, margin, is_behind):
+    def flown(time, reward):
+        times = {TOLERANCE: np.array([time, np.nan])}
+        same = np.ones(2)
+        flights = SimpleNamespace(survival=same, success=same, reward=reward, settling_time=times)
+        return Flown("agent", flights)
+
+    agent, other = flown(slower, np.array([-1.0, -1.0])), flown(1.0, np.array([-1.1, -1.2]))
+    assert agent.is_behind(other, margin) == is_behind

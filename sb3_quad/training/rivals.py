@@ -29,6 +29,9 @@ LOST = 0.02
 # Training continues from the agent of the stage before, whose network is smaller and learns faster,
 # unless it earns this share less than another one.
 HEAD_START = 0.2
+# Nor does it from one that takes this many times as long to settle: it swings at its target, and
+# its gradients may diverge.
+SLOW = 1.5
 
 
 class Flown(NamedTuple):
@@ -45,7 +48,8 @@ class Flown(NamedTuple):
         """Whether it loses more flights, fails in more, or earns less; rewards on the same
         episodes, beyond chance.
 
-        :param margin: the share of the other's mean reward that it may earn less.
+        :param margin: the share of the other's mean reward that it may earn less. With one, it is
+            behind if it settles much later, too.
         """
         flights, others = self.flights, other.flights
         lost = others.survival.mean() - flights.survival.mean()
@@ -56,16 +60,23 @@ class Flown(NamedTuple):
         failed = others.success.mean() - flights.success.mean()
         if abs(failed) >= LOST:
             return bool(failed > 0.0)
+        if margin > 0.0 and self.settling_time > SLOW * other.settling_time:
+            return True
         least = others.reward - margin * abs(others.reward.mean())
         return is_below(flights.reward, least)
 
+    @property
+    def settling_time(self) -> float:
+        """The mean over the flights that settle, s; 0 if none does."""
+        times = self.flights.settling_time[TOLERANCE]
+        settled = times[np.isfinite(times)]
+        return float(settled.sum() / max(settled.size, 1))
+
     def __str__(self) -> str:
         flights = self.flights
-        times = flights.settling_time[TOLERANCE]
-        settled = times[np.isfinite(times)]
         return (
             f"{self.label}: survival {100 * flights.survival.mean():.1f} %, "
-            f"settling time {settled.sum() / max(settled.size, 1):.2f} s, "
+            f"settling time {self.settling_time:.2f} s, "
             f"final error {np.median(flights.final_error):.3f} m, "
             f"mean reward {flights.reward.mean():.2f}"
         )
