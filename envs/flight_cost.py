@@ -78,14 +78,10 @@ def cost_and_gradients(
     action_tensor = th.from_numpy(actions).double().requires_grad_()
     # Split once: for each slice, autograd would add up an array of all states.
     sizes = [*STATE.values()][: -len(REFERENCE_PARTS)]
-    parts = [
-        part.transpose(1, 2)
-        for part in (
-            *th.split(flown, sizes, dim=1),
-            *th.split(reference, [*REFERENCE_PARTS.values()], dim=1),
-        )
-    ]
-    costs = cost(FlownStates._make([*parts, action_tensor]))
+    parts = th.split(flown, sizes, dim=1)
+    parts += th.split(reference, [*REFERENCE_PARTS.values()], dim=1)
+    turned = [part.transpose(1, 2) for part in parts]
+    costs = cost(FlownStates._make([*turned, action_tensor]))
     shape = tuple(counts.shape)
     if not isinstance(costs, th.Tensor) or costs.shape != shape or not costs.requires_grad:
         given = getattr(costs, "shape", type(costs).__name__)

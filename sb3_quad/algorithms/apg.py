@@ -90,11 +90,10 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
 
     The equations of motion are known and smooth, so the gradient of a flight's cost with respect to
     the policy's weights can be computed exactly: the flight is recorded, then the derivative is
-    carried back through policy, observation, delay, rotors and rigid body. There is no critic and
-    no exploration, and no teacher. Related methods are backpropagation through
-    time (Werbos, 1990), SHAC (Xu et al., 2022), which adds a critic to short windows, and Heeg,
-    Song and Scaramuzza, "Learning Quadrotor Control From Visual Features Using Differentiable
-    Simulation" (2024).
+    carried back through policy, observation, delay, rotors and rigid body. There is no critic,
+    no exploration and no teacher. Related methods are backpropagation through time (Werbos, 1990),
+    SHAC (Xu et al., 2022), which adds a critic to short windows, and Heeg, Song and Scaramuzza,
+    "Learning Quadrotor Control From Visual Features Using Differentiable Simulation" (2024).
 
     In each update every environment flies ``n_steps`` control steps with the mean action of the
     policy. The optimiser then takes one step along the gradient of the mean cost. It is

@@ -14,11 +14,13 @@ from numba import float32
 from sb3_quad.base.compiled import compiled, inner
 from sb3_quad.base.types import Float32Array, IntArray
 from sb3_quad.fast.losses import actor_loss, critic_loss
-from sb3_quad.fast.tiles import HEIGHT, multiply
+from sb3_quad.fast.tiles import multiply, padded
 
 # Rows per block: few enough for a layer of 64 units and its gradients to fit into half a megabyte
 ROWS = 256
 LINEAR, TANH, RELU = range(3)
+# Rows of a block for some rows of the mini-batch
+_padded = inner(padded)
 # Not "nnan": NaN and infinity must stay what they are
 _FAST = {"reassoc", "contract", "nsz"}
 # Beyond this, tanh is 1 in float32
@@ -100,12 +102,6 @@ def _load(rows, index, first, count, h):
             h[i, k] = row[k]
         h[i, given:] = 0.0
     h[count:] = 0.0
-
-
-@inner
-def _padded(count):
-    """Return the rows of a block for ``count`` rows of the mini-batch."""
-    return (count + HEIGHT - 1) // HEIGHT * HEIGHT
 
 
 @inner

@@ -23,7 +23,7 @@ from sb3_quad.fast.kernel import (
     pullback,
 )
 from sb3_quad.fast.losses import TERMS, Numbers
-from sb3_quad.fast.tiles import HEIGHT
+from sb3_quad.fast.tiles import padded
 
 # A mini-batch is cut into at most this many chunks. Their sums are added up in order, so that
 # results do not depend on the number of threads, to the bit.
@@ -49,7 +49,7 @@ class Perceptron:
         self._linear: list[Any] = [*modules[::2]]
         kinds = np.array([*(_ACTIVATIONS[type(layer)] for layer in modules[1::2]), LINEAR])
         sizes = [self._linear[0].in_features, *(layer.out_features for layer in self._linear)]
-        widths = np.array([_padded(size) for size in sizes])
+        widths = np.array([padded(size) for size in sizes])
         self._units = int(widths.sum())
         self._scratch_size = (self._units + 2 * int(widths.max())) * ROWS
         self._size = int((widths[1:] * (widths[:-1] + 1)).sum())
@@ -148,7 +148,7 @@ class Perceptron:
         :return: memory for the activations, (calls, ...), and for the sums of all calls.
         """
         blocks = -(-n // ROWS)
-        size = self._units * min(ROWS, _padded(n))
+        size = self._units * min(ROWS, padded(n))
         activations = _aligned(calls * blocks * size).reshape(calls, blocks, size)
         return activations, np.empty((_chunks(n), self._size), np.float32)
 
@@ -208,10 +208,6 @@ class Perceptron:
 
 def _flat(observations: AnyArray) -> Float32Array:
     return np.ascontiguousarray(observations, dtype=np.float32).reshape(len(observations), -1)
-
-
-def _padded(size: int) -> int:
-    return -(-size // HEIGHT) * HEIGHT
 
 
 def _chunks(n: int) -> int:

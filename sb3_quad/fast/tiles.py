@@ -63,22 +63,22 @@ def _tile(width: int, chains: int) -> Any:
 
             rows = [builder.add(j, j.type(row)) for row in range(HEIGHT)]
             zero = vector_type([0.0] * width)
-            sums = [cgutils.alloca_once_value(builder, zero) for _ in range(chains) for _ in rows]
+            sums = [[cgutils.alloca_once_value(builder, zero) for _ in rows] for _ in range(chains)]
             with cgutils.for_range_slice(builder, first, last, first.type(chains)) as (start, _):
-                for chain in range(chains):
+                for chain, totals in enumerate(sums):
                     k = builder.add(start, start.type(chain))
                     factor = builder.load(vector(1, k), align=4)
-                    for row, total in zip(rows, sums[HEIGHT * chain :], strict=False):
+                    for row, total in zip(rows, totals, strict=True):
                         empty = vector_type(ir.Undefined)
                         number = builder.load(place(0, row, k))
                         number = builder.insert_element(empty, number, _FIRST)
                         numbers = builder.shuffle_vector(number, empty, all_the_first)
                         product = builder.fmul(numbers, factor, **_FUSED)
                         builder.store(builder.fadd(builder.load(total), product, **_FUSED), total)
-            for n, row in enumerate(rows):
+            for row, *totals in zip(rows, *sums, strict=True):
                 before = builder.load(vector(2, row), align=4)
                 result = builder.select(adds, before, zero)
-                for total in sums[n::HEIGHT]:
+                for total in totals:
                     result = builder.fadd(result, builder.load(total))
                 builder.store(result, vector(2, row), align=4)
             return context.get_dummy_value()
@@ -86,6 +86,11 @@ def _tile(width: int, chains: int) -> Any:
         return signature, generate
 
     return add_to_tile
+
+
+def padded(size: int) -> int:
+    """Return the least multiple of ``HEIGHT`` that is not below ``size``."""
+    return -(-size // HEIGHT) * HEIGHT
 
 
 _add_to_wide = _tile(_WIDTH, 1)
@@ -103,10 +108,10 @@ def multiply(a, b, c, adds):
     wide = columns // _WIDTH * _WIDTH
     for first in range(0, b.shape[0], _TERMS):
         last = min(b.shape[0], first + _TERMS)
-        goes_on = adds or first > 0
+        adds_here = adds or first > 0
         for i in range(0, wide, _WIDTH):
             for j in range(0, rows, HEIGHT):
-                _add_to_wide(a, b, c, j, i, first, last, goes_on)
+                _add_to_wide(a, b, c, j, i, first, last, adds_here)
         for i in range(wide, columns, HEIGHT):
             for j in range(0, rows, HEIGHT):
-                _add_to_narrow(a, b, c, j, i, first, last, goes_on)
+                _add_to_narrow(a, b, c, j, i, first, last, adds_here)
