@@ -96,7 +96,8 @@ def test_who_loses_or_misses_more_is_behind(lost, missed, reward, is_behind):
 
 
 @pytest.mark.parametrize(
-    ("slower", "margin", "is_behind"), [(2.0, 0.2, True), (1.2, 0.2, False), (2.0, 0.0, False)]
+    ("slower", "margin", "is_behind"),
+    [(2.0, 0.2, True), (np.nan, 0.2, True), (1.2, 0.2, False), (2.0, 0.0, False)],
 )
 def test_training_does_not_begin_from_who_settles_much_later(slower, margin, is_behind):
     def flown(time, reward):
@@ -107,3 +108,5 @@ def test_training_does_not_begin_from_who_settles_much_later(slower, margin, is_
 
     agent, other = flown(slower, np.array([-1.0, -1.0])), flown(1.0, np.array([-1.1, -1.2]))
     assert agent.is_behind(other, margin) == is_behind
+    # Nobody is late beside one that never settles.
+    assert not agent.is_behind(flown(np.nan, np.array([-1.1, -1.2])), margin)

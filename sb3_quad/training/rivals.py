@@ -4,6 +4,7 @@ Before a stage they fly it on the same episodes as the agent of the stage before
 starts from what is best there, and hands over nothing that is worse.
 """
 
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -67,10 +68,10 @@ class Flown(NamedTuple):
 
     @property
     def settling_time(self) -> float:
-        """The mean over the flights that settle, s; 0 if none does."""
+        """The mean over the flights that settle, s; infinite if none does."""
         times = self.flights.settling_time[TOLERANCE]
         settled = times[np.isfinite(times)]
-        return float(settled.sum() / max(settled.size, 1))
+        return float(settled.mean()) if settled.size else math.inf
 
     def __str__(self) -> str:
         flights = self.flights
