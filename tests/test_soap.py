@@ -49,19 +49,24 @@ def test_it_descends_further_than_adam_where_weights_are_correlated():
     assert th.tensor(ratios).log().mean().exp() < 0.9
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_the_first_change_of_bases_does_not_lengthen_the_update(seed):
-    """Where gradients are large in a few directions, and each spans some others."""
+def growth(seed):
+    """Return how much longer the update with the first changed bases is than the one before."""
     th.manual_seed(seed)
     weights = th.zeros(16, 32, requires_grad=True)
     optimizer = SOAP([weights])
     lengths = []
     for _ in range(REFRESH):
         before = weights.detach().clone()
+        # Large in a few directions, and each gradient spans some others
         weights.grad = th.logspace(0.0, -3.0, 16)[:, None] * th.randn(16, 4) @ th.randn(4, 32)
         optimizer.step()
         lengths.append(th.dist(weights, before).item())
-    assert lengths[-1] < 3.0 * lengths[-2]
+    return lengths[-1] / lengths[-2]
+
+
+def test_the_first_change_of_bases_does_not_lengthen_the_update():
+    """By the geometric mean, which is about 2; with bases in another order it is 18."""
+    assert th.tensor([growth(seed) for seed in range(20)]).log().mean().exp() < 6.0
 
 
 def test_its_state_resumes_exactly():
