@@ -20,6 +20,7 @@ from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
 
 from sb3_quad.base.process import print_once
+from sb3_quad.base.wide_vectors import WideCompiler
 
 # Rows of a block: a multiple of every vector width, and few enough for a block to stay in the L1
 # cache
@@ -39,7 +40,9 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     if function is None:
         return functools.partial(compiled, **options)
     options = {"forceinline": True, "no_cfunc_wrapper": True, **options}
-    dispatcher = numba.njit(error_model="numpy", nogil=True, **options)(function)
+    dispatcher = numba.njit(
+        error_model="numpy", nogil=True, pipeline_class=WideCompiler, **options
+    )(function)
     if "no_cpython_wrapper" in options:
         dispatcher.__class__ = _Inner
     try:
