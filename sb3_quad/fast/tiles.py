@@ -7,13 +7,17 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.registry import cpu_target
 from numba.extending import intrinsic
 
 from sb3_quad.base.compiled import inner
 
 HEIGHT = 4
 """Rows of a tile; matrices have a multiple of it as rows and as columns."""
-_WIDTH = 16
+_PROCESSOR = cpu_target.target_context.codegen().magic_tuple()
+# Columns of a tile whose sums fill eight registers, of 512 bits where the processor has them
+_WIDE = 32 if "+avx512f" in _PROCESSOR[-1] else 16
+_MEDIUM = 16
 # Terms of a sum in one go, so that what a column of tiles reads stays in the L1 cache
 _TERMS = 256
 _FIRST = ir.IntType(32)(0)
@@ -23,9 +27,8 @@ _FUSED = {"flags": ("contract",)}
 def _tile(width: int, chains: int) -> Any:
     """Return a compiled function for tiles of ``width`` columns.
 
-    A processor is busy with eight sums at a time, and has eight more registers for factors. A tile
-    of 16 columns fills eight registers of 256 bits; a narrower one has ``chains`` sums for each
-    number, which are added up in the end.
+    A processor is busy with eight registers of sums at a time, and has eight more for factors. A
+    narrower tile has ``chains`` sums for each number, which are added up in the end.
     """
     vector_type = ir.VectorType(ir.FloatType(), width)
     all_the_first = ir.Constant(ir.VectorType(_FIRST.type, width), [0] * width)
@@ -93,7 +96,8 @@ def padded(size: int) -> int:
     return -(-size // HEIGHT) * HEIGHT
 
 
-_add_to_wide = _tile(_WIDTH, 1)
+_add_to_wide = _tile(_WIDE, 1)
+_add_to_medium = _tile(_MEDIUM, 1)
 _add_to_narrow = _tile(HEIGHT, 2)
 
 
@@ -105,13 +109,17 @@ def multiply(a, b, c, adds):
     """
     rows = a.shape[0]
     columns = b.shape[1]
-    wide = columns // _WIDTH * _WIDTH
+    wide = columns // _WIDE * _WIDE
+    medium = columns // _MEDIUM * _MEDIUM
     for first in range(0, b.shape[0], _TERMS):
         last = min(b.shape[0], first + _TERMS)
         adds_here = adds or first > 0
-        for i in range(0, wide, _WIDTH):
+        for i in range(0, wide, _WIDE):
             for j in range(0, rows, HEIGHT):
                 _add_to_wide(a, b, c, j, i, first, last, adds_here)
-        for i in range(wide, columns, HEIGHT):
+        for i in range(wide, medium, _MEDIUM):
+            for j in range(0, rows, HEIGHT):
+                _add_to_medium(a, b, c, j, i, first, last, adds_here)
+        for i in range(medium, columns, HEIGHT):
             for j in range(0, rows, HEIGHT):
                 _add_to_narrow(a, b, c, j, i, first, last, adds_here)
