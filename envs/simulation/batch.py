@@ -287,7 +287,7 @@ class QuadcopterBatch:
 
         Where a row is done, ``outcome`` (fields total, reward, length, distance, collision,
         out_of_range, truncated, success) and ``last_observations`` hold how its episode ended until
-        its next one ends. Without autoreset they are those of every row's last step.
+        its next one ends. Without autoreset ``outcome`` is that of every row's last step.
 
         :param actions: (n, 4), clipped to [-1, 1].
         :return: observations float32 (n, size), rewards float32 (n,), done bool (n,): fresh arrays.

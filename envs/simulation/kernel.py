@@ -669,6 +669,7 @@ def _end_episodes(
         end.total = returns[i] + spared
         end.reward = b.reward[lane] + spared
         end.length = b.stream[STEP, lane]
-        for k in range(observations.shape[1]):
-            last_observations[i, k] = observations[i, k]
+        if autoreset:
+            for k in range(observations.shape[1]):
+                last_observations[i, k] = observations[i, k]
     return ended

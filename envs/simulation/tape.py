@@ -9,7 +9,7 @@ from numba import float32
 
 from sb3_quad.base.compiled import LANES, atomic_add, compiled, inner
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.types import BoolArray, Float32Array, FloatArray
+from sb3_quad.base.types import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.envs.simulation.adjoint import (
     CARRIED,
     DIFFERENTIATED,
@@ -107,6 +107,13 @@ class FlightTape:
         self._wrenches = np.zeros((n_steps, *batch.wrench.shape))
         self._winds = np.zeros((n_steps, *batch.wind.shape))
         self._filtered = np.zeros((n_steps, *batch.filtered_rates.shape))
+        # Those that are not empty, each with the batch's own array, which changes in place
+        both = (
+            (self._integrals, batch.integral),
+            (self._estimates, batch.estimate),
+            (self._filtered, batch.filtered_rates),
+        )
+        self._kept = [(kept, present) for kept, present in both if present.size]
 
     def reset(self, continue_flights: bool = False) -> Float32Array:
         """Begin a recording; return the observations, float32 (n, size).
@@ -145,25 +152,31 @@ class FlightTape:
         if t == 0:
             self.states[0] = batch.state
         self.actions[t] = actions
-        self._integrals[t] = batch.integral
-        self._estimates[t] = batch.estimate
         self._wrenches[t] = batch.total_wrench()
         self._winds[t] = batch.total_wind()
-        self._filtered[t] = batch.filtered_rates
-        observations, self.rewards[t], _ = batch.step_on(actions, self.substeps)
+        for kept, present in self._kept:
+            kept[t] = present
+        observations, self.rewards[t], dones = batch.step_on(actions, self.substeps)
         self._at = t + 1
         self.states[self._at] = batch.state
-        over = ~batch.outcome["truncated"]
-        newly_lost = over & ~self.lost
-        if newly_lost.any():
-            self.lengths[newly_lost] = self._at
-            self.lost |= newly_lost
-            # Their episodes are over for later recordings, too, and for those of a resumed run.
-            batch.limits[newly_lost] = 0
-        if not self._end_at_ground:
-            over &= batch.outcome["out_of_range"] | ~batch.outcome["collision"]
-        np.minimum(self.ends, self._at, out=self.ends, where=over)
+        done = dones.nonzero()[0]
+        if done.size:
+            self._note_ends(done)
         return observations
+
+    def _note_ends(self, rows: IntArray) -> None:
+        """Note which of these rows the last step has ended; the time limit of others is over."""
+        outcome = self.batch.outcome.take(rows)
+        is_over = ~outcome["truncated"]
+        newly_lost = rows[is_over & ~self.lost[rows]]
+        self.lengths[newly_lost] = self._at
+        self.lost[newly_lost] = True
+        # Their episodes are over for later recordings, too, and for those of a resumed run.
+        self.batch.limits[newly_lost] = 0
+        if not self._end_at_ground:
+            is_over &= outcome["out_of_range"] | ~outcome["collision"]
+        over = rows[is_over]
+        self.ends[over] = np.minimum(self.ends[over], self._at)
 
     @property
     def counts(self) -> BoolArray:

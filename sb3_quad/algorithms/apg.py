@@ -147,7 +147,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     policy_aliases = PPO.policy_aliases
     # If they were saved, algorithms with a critic would adopt these placeholders.
     _not_saved = (
-        *("cost", "_tape", "_recorded_policy", "_compared"),
+        *("cost", "_tape", "_network", "_recorded_policy", "_compared"),
         *("gamma", "gae_lambda", "ent_coef", "vf_coef"),
     )
     _tape: Tape
@@ -293,8 +293,8 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         unfit = f"{type(env).__name__}: does not record with {[*options]}"
         with raised_as(ConfigError, unfit):
             self._tape = env.record(self.n_steps, self.substeps, **options)
-        network = network_of(self.policy)
-        self._recorded_policy = network.recorded(self.n_steps, self.n_envs)
+        self._network = network_of(self.policy)
+        self._recorded_policy = self._network.recorded(self.n_steps, self.n_envs)
         if reset_num_timesteps:
             self._least_cost = None
             self._usual_change = 0.0
@@ -419,7 +419,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
     def _action_change(self) -> float:
         """Return how far the last step moved the mean actions, as a root mean square."""
         observations, actions = map(np.concatenate, zip(*self._compared, strict=True))
-        change = network_of(self.policy).means(observations) - actions
+        change = self._network.means(observations) - actions
         return float(np.sqrt(np.square(change).mean()))
 
     def _undo(self, reason: str, history: History) -> None:
@@ -449,11 +449,10 @@ def _limited(gradients, max_ratio):  # type: ignore[no-untyped-def]
             lengths[row] += number * number
         lengths[row] = math.sqrt(lengths[row])
     # Rows whose flight was lost have zero gradients.
-    present = np.sort(lengths[lengths != 0.0])
+    present = lengths[lengths != 0.0]
     result = gradients.copy()
     if present.size > 0:
-        middle = (present[(present.size - 1) // 2] + present[present.size // 2]) / 2.0
-        limit = max_ratio * middle
+        limit = max_ratio * np.median(present)
         for row in range(len(gradients)):
             if not lengths[row] <= limit:
                 result[row] *= limit / lengths[row]

@@ -1,5 +1,6 @@
 """A multilayer perceptron and its gradients, by :mod:`.kernel`, on the threads that PyTorch had."""
 
+import functools
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +12,7 @@ import torch as th
 from torch import nn
 
 from sb3_quad.algorithms.buffers import Batch
-from sb3_quad.base.types import AnyArray, Float32Array, FloatArray
+from sb3_quad.base.types import AnyArray, Float32Array, FloatArray, IntArray
 from sb3_quad.fast.kernel import (
     LINEAR,
     RELU,
@@ -120,7 +121,7 @@ class Perceptron:
             self.pack(backward=False)
         n = len(observations)
         out = np.empty((n, self._linear[-1].out_features), np.float32)
-        self._compute(forward, n, _flat(observations), np.arange(n), out, activations)
+        self._compute(forward, n, _flat(observations), _all_rows(n), out, activations)
         return out
 
     def gradient(self, batch: Batch, loss: Numbers, log_std: th.Tensor | None = None) -> FloatArray:
@@ -163,7 +164,7 @@ class Perceptron:
         """
         n = len(grad_outputs)
         grad_inputs = np.empty((n, self._linear[0].in_features), np.float32)
-        self._compute(pullback, n, activations, np.arange(n), grad_outputs, grad_inputs, sums)
+        self._compute(pullback, n, activations, _all_rows(n), grad_outputs, grad_inputs, sums)
         return grad_inputs
 
     def set_gradients(self, sums: Float32Array) -> th.Tensor:
@@ -208,6 +209,12 @@ class Perceptron:
 
 def _flat(observations: AnyArray) -> Float32Array:
     return np.ascontiguousarray(observations, dtype=np.float32).reshape(len(observations), -1)
+
+
+@functools.lru_cache(maxsize=8)
+def _all_rows(n: int) -> IntArray:
+    """Return the numbers of n rows, which nobody writes to."""
+    return np.arange(n)
 
 
 def _chunks(n: int) -> int:
