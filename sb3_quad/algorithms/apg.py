@@ -127,7 +127,7 @@ class APG(ExpertMixin, OnPolicyAlgorithm):
         least all flights of an update.
     :param initial_policy: The agent to start from: a model, the path of a zip, or the name of a
         shipped agent. Learning whole flights from scratch works badly: clone an expert first
-        (DAgger), or fly short windows with ``continue_flights``.
+        (DAgger), or fly short windows with ``continue_flights`` at a rate such as 6e-3.
     :param continue_flights: Let each update continue the flights of the one before. A flight that
         crashed or reached its time limit begins again.
     :param end_at_ground: Whether a flight that crashes ends there. It then has no gradient that
