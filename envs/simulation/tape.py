@@ -107,13 +107,6 @@ class FlightTape:
         self._wrenches = np.zeros((n_steps, *batch.wrench.shape))
         self._winds = np.zeros((n_steps, *batch.wind.shape))
         self._filtered = np.zeros((n_steps, *batch.filtered_rates.shape))
-        # Those that are not empty, each with the batch's own array, which changes in place
-        both = (
-            (self._integrals, batch.integral),
-            (self._estimates, batch.estimate),
-            (self._filtered, batch.filtered_rates),
-        )
-        self._kept = [(kept, present) for kept, present in both if present.size]
 
     def reset(self, continue_flights: bool = False) -> Float32Array:
         """Begin a recording; return the observations, float32 (n, size).
@@ -152,10 +145,11 @@ class FlightTape:
         if t == 0:
             self.states[0] = batch.state
         self.actions[t] = actions
+        self._integrals[t] = batch.integral
+        self._estimates[t] = batch.estimate
         self._wrenches[t] = batch.total_wrench()
         self._winds[t] = batch.total_wind()
-        for kept, present in self._kept:
-            kept[t] = present
+        self._filtered[t] = batch.filtered_rates
         observations, self.rewards[t], dones = batch.step_on(actions, self.substeps)
         self._at = t + 1
         self.states[self._at] = batch.state

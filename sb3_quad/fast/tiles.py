@@ -14,10 +14,10 @@ from sb3_quad.base.compiled import inner
 
 HEIGHT = 4
 """Rows of a tile; matrices have a multiple of it as rows and as columns."""
-_PROCESSOR = cpu_target.target_context.codegen().magic_tuple()
-# Columns of a tile whose sums fill eight registers, of 512 bits where the processor has them
-_WIDE = 32 if "+avx512f" in _PROCESSOR[-1] else 16
+_, _, _FEATURES = cpu_target.target_context.codegen().magic_tuple()
+# Columns of a tile whose sums fill eight registers of 256 bits, and of the processor's widest
 _MEDIUM = 16
+_WIDE = 32 if "+avx512f" in _FEATURES else _MEDIUM
 # Terms of a sum in one go, so that what a column of tiles reads stays in the L1 cache
 _TERMS = 256
 _FIRST = ir.IntType(32)(0)
